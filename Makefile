@@ -115,12 +115,13 @@ test-all: $(STAMP) ## every test
 test-jax: $(NEWER)/.made ## tests of what is computed, under another jax in its own environment: [JAX=0.12.0.1 NEWPYTHON=python3.13]
 	$(NEWER)/bin/python -m pytest -n $(WORKERS) --dist loadfile -m "not slow" tests/ops tests/nn tests/train tests/parity tests/test_objectives.py
 
-lint: $(STAMP) ## ruff (rules and format), mypy, the rules of prose and the table of imports
+lint: $(STAMP) ## ruff (rules and format), mypy, the table of imports, and a report of sizes
 	$(PY) -m ruff check $(CHECKED)
 	$(PY) -m ruff format --check $(CHECKED)
 	$(PY) -m mypy
-	$(PY) -m tests.prose.check
 	$(PY) -m pytest tests/laws/test_architecture.py
+	@find src experiments tests -name '*.py' | cut -d/ -f1 | sort | uniq -c | while read files room; do \
+		echo "$$room: $$files files, $$(find $$room -name '*.py' -exec cat {} + | grep -c .) lines"; done
 
 format: $(STAMP) ## rewrite the sources in the project's format
 	$(PY) -m ruff check --fix $(CHECKED)

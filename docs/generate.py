@@ -1,5 +1,4 @@
-"""Pages of the documentation site that are made from the package: commands, API, results and
-tutorials.
+"""Generated pages of the documentation site: commands, API, results and tutorials.
 
 python -m docs.generate        writes docs/reference/, docs/results/ and docs/tutorials/
 """
@@ -22,16 +21,19 @@ DOCS = Path(__file__).resolve().parent
 ROOT = DOCS.parent
 RESULTS = ROOT / "experiments" / "results"
 NOTEBOOKS = ROOT / "experiments" / "notebooks"
-# a search finds how-to pages before results and references
+# A search finds how-to pages before results and references.
 _LOW = "---\nsearch:\n  boost: 0.2\n---\n\n"
-_ROOMS = {
+# The title of a public name's place in the API reference, by the first part of its module.
+_TITLES = {
     "encoder": "Encoders",
+    "zoo": "Encoders",
+    "export": "Encoders",
     "evaluate": "Probes",
     "ops": "Pure functions",
     "objectives": "Losses of the two stages",
     "nn": "Networks",
     "train": "Training",
-    "pretrain": "Training",
+    "training": "Training",
     "batch": "Batches",
     "config": "Settings",
     "data": "Data",
@@ -42,9 +44,7 @@ _ROOMS = {
 
 
 def help_of(command: str) -> str:
-    """Return the help text of a command, 80 columns wide, without the frames that a terminal
-    draws.
-    """
+    """Return the help of a command, 80 columns wide, without the frames that a terminal draws."""
     os.environ["COLUMNS"] = "80"
     text = io.StringIO()
     with contextlib.redirect_stdout(text), contextlib.suppress(SystemExit):
@@ -65,15 +65,15 @@ def commands_page() -> str:
 
 
 def api_page() -> str:
-    """Return the API reference: every public name, by room."""
-    rooms: dict[str, list[str]] = {}
+    """Return the API reference: every public name, under the title of its room."""
+    entries: dict[str, list[str]] = {}
     for name in at.__all__:
         module, attribute = at._HOME[name]
-        title = _ROOMS[module.split(".")[0]]
-        rooms.setdefault(title, []).append(f"::: anytouch_jax.{module}.{attribute}\n")
+        title = _TITLES[module.split(".")[0]]
+        entries.setdefault(title, []).append(f"::: anytouch_jax.{module}.{attribute}\n")
     parts = [f"{_LOW}# API reference\n\nImport these names from `anytouch_jax`.\n"]
-    for title in dict.fromkeys(_ROOMS.values()):
-        parts += [f"## {title}\n", *rooms.get(title, [])]
+    for title in dict.fromkeys(_TITLES.values()):
+        parts += [f"## {title}\n", *entries.get(title, [])]
     return "\n".join(parts)
 
 
@@ -88,7 +88,7 @@ def tutorial(notebook: Path, folder: Path) -> str:
         parts.append(source if cell["cell_type"] == "markdown" else f"```python\n{source}\n```")
         for place, output in enumerate(cell.get("outputs", ())):
             if printed := "".join(output.get("text", ())).strip():
-                # printed text does not end it
+                # The fence is longer than any in the printed text, so that the text cannot end it.
                 fence = max(["``", *re.findall("`+", printed)], key=len) + "`"
                 parts.append(f"{fence}text\n{printed}\n{fence}")
             if picture := output.get("data", {}).get("image/png"):

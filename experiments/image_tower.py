@@ -12,7 +12,7 @@ from anytouch_jax.encoder.base import Encoder, bare_model, precision
 from anytouch_jax.errors import UserError
 from anytouch_jax.nn.clip import merge_lora
 from anytouch_jax.nn.functional import build
-from anytouch_jax.weights import load
+from anytouch_jax.weights import load, start
 
 
 def image_tower_encoder(path: str | Path) -> Encoder:
@@ -33,5 +33,5 @@ def image_tower_encoder(path: str | Path) -> Encoder:
     )
     with precision(loaded.config):
         fresh = {"touch": build(bare).init(jax.random.key(0))["touch"]}
-    touch = load.inflate(fresh, jax.tree.map(np.asarray, tower), divide=True)
+    touch = start.inflate(fresh, jax.tree.map(np.asarray, tower), divide=True)
     return Encoder(replace(loaded.config, model=bare), touch, f"{path} (image tower)")

@@ -103,9 +103,7 @@ def test_training_and_probes_read_the_same_differences(touches, stored, used):
     "change", [{"jitter": (0.4, 0.4, 0.5, 0.3), "flip": 0.5}, {"affine": (20.0, 0.1, 0.1)}]
 )
 def test_another_light_or_place_leaves_the_untouched_gel_grey(touches, change):
-    """A touch is changed before the gel is taken off: after it a change of brightness would
-    outshine the contact.
-    """
+    """Augmentation comes first: after it a change of brightness would outshine the contact."""
     table = manifests.read(touches)
     cells = {name: table.column(name).to_pylist() for name in table.table.column_names}
     cells["path"] = cells["background_path"]  # nobody touches
@@ -186,7 +184,8 @@ def test_a_picture_frames_or_a_head_decide_what_a_camera_subtracts(encoder):
     with pytest.raises(UserError, match="not both"):
         Preprocess(encoder, GEL, frames=frames)
     with pytest.raises(
-        UserError, match=r"at\.untouched_gel\(frames\).*at\.Preprocess\(encoder, frames=frames\)"
+        UserError,
+        match=r"at\.estimate_background\(frames\).*at\.Preprocess\(encoder, frames=frames\)",
     ):
         encoder.preprocess(GEL)
     plain = Preprocess(replace(encoder, config=replace(encoder.config, data=DataConfig())))
@@ -266,9 +265,7 @@ def test_the_pouring_policy_sees_what_changed_since_its_run_began(encoder):
 
 
 def test_either_subtracts_half_of_the_samples_and_every_known_background_in_evaluation(touches):
-    """Each row is drawn by itself, again in every epoch; a row without an untouched gel is never
-    subtracted.
-    """
+    """Each row is drawn by itself, again in every epoch; one without a gel stays as it is."""
     table = manifests.read(touches)
     readers = {
         mode: SampleReader(table, settings(touches, mode))

@@ -196,9 +196,11 @@ def test_garbage_in_unused_slots_changes_nothing():
 def test_towers_that_nothing_is_shown_to_cost_nothing_and_need_not_exist():
     slots = ("image", "image_row", "text", "text_mask", "text_row")
     none = ALIGN._replace(**{name: getattr(ALIGN, name)[:0] for name in slots})
-    terms = lambda p, b: objectives.stage2_terms(
-        p, Stage2Batch(b, None), None, net=NET2, config=CONFIG2
-    )
+
+    def terms(p, b):
+        batch = Stage2Batch(b, None)
+        return objectives.stage2_terms(p, batch, None, net=NET2, config=CONFIG2)
+
     # no towers, no decoder, no matching head
     touch = {name: PARAMS2[name] for name in ("touch", "logit_scale")}
     encode = flops(lambda p: NET2.encode_touch(p, ALIGN.clip, SENSOR), touch)
@@ -352,9 +354,11 @@ def drawn(monkeypatch, config, progress, rows=64):
     empty = np.zeros((0, 28, 28, 3), np.uint8), np.zeros(0, np.int32)
     text = np.zeros((0, 8), np.int32), np.zeros((0, 8), bool), np.zeros(0, np.int32)
     batch = Stage2Batch(AlignBatch(one, sensor, *empty, *text), MatchBatch(*(one, sensor) * 3))
-    run = lambda p: (objectives.stage2_loss({}, batch, KEY, p, net=NET2, config=config), received)[
-        1
-    ]
+
+    def run(p):
+        objectives.stage2_loss({}, batch, KEY, p, net=NET2, config=config)
+        return received
+
     own, *rows = map(np.asarray, jax.jit(run)(np.float32(progress)))
     # the decoder gets the sensor's own tokens
     np.testing.assert_array_equal(own, sensor)

@@ -1,4 +1,5 @@
 import fcntl
+import json
 import os
 import shutil
 import subprocess
@@ -12,12 +13,15 @@ import pytest
 from runs import arrays_of, read_metrics, read_rows, run_config, saved_steps, train, write_manifest
 from weights_world import save_clip
 
+from anytouch_jax import doors
 from anytouch_jax.config import SENSORS, from_json
 from anytouch_jax.data import tokenizer as texts
 from anytouch_jax.data.loading.loader import Loader
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.errors import UserError
 from anytouch_jax.nn.functional import build
+from anytouch_jax.train.mesh import make_mesh
+from anytouch_jax.training.start import resolve
 from anytouch_jax.weights import checkpoint
 from anytouch_jax.weights.load import load_model
 from anytouch_jax.weights.tree import flatten
@@ -28,7 +32,7 @@ import sys
 from pathlib import Path
 import numpy as np
 from runs import arrays_of, train
-from test_pretrain import clips_only, run_config
+from test_training import clips_only, run_config
 world, stage, run, stop = sys.argv[1:]
 result = train(clips_only(run_config(Path(world), int(stage))), Path(run), stop_after=int(stop))
 np.savez(f"{run}.npz", **arrays_of(result))
@@ -89,6 +93,28 @@ def test_a_run_folder(straight, world):
     assert (
         metadata["preprocessing"]["touch"]["size"] == 28
         and metadata["preprocessing"]["touch"]["channels"] == "RGB"
+    )
+
+
+def test_a_start_is_resolved_before_anything_is_written(straight, world, tmp_path):
+    """The record has all that decides a run: its vocabulary, its warm-up, its first parameters."""
+    config = clips_only(run_config(world, 2))
+    options = {"init": straight[0], "clip": None, "mesh": make_mesh(), "log": lambda _: None}
+    start = resolve(config, tmp_path / "r", **options)
+    assert not (tmp_path / "r").exists() and not start.resumes
+    assert start.config.model.text.vocab == start.tokenizer.vocab_size < 2048
+    assert start.config.optim.warmup == 1 and config.optim.warmup is None
+    assert start.metadata["source"] == {"init": str(straight[0]), "clip": None}
+    learned = load_model(straight[0]).params
+    for name, array in parts(learned, "touch").items():
+        np.testing.assert_array_equal(parts(start.params, "touch")[name], array, err_msg=name)
+    again = resolve(run_config(world), straight[0], **options | {"init": None})
+    assert again.resumes and again.tokenizer is None
+    assert any(
+        "is not read" in note
+        for note in resolve(
+            run_config(world), straight[0], **options | {"init": tmp_path / "other"}
+        ).notes
     )
 
 
@@ -357,3 +383,37 @@ def test_a_run_does_not_resume_on_other_rows(world, tmp_path):
     # the same rows and files at another place
     write_manifest(moved / "other.csv", rows[:-1])
     assert train(run_config(moved / "other.csv"), tmp_path / "r", stop_after=2).step == 2
+
+
+RINGS = ("sim", "fields", "datasets", "live", "zoo", "export")
+TRAINED = """
+import json, sys
+from pathlib import Path
+from runs import run_config, train
+train(run_config(Path(sys.argv[1]), steps=1), Path(sys.argv[2]))
+print(json.dumps([name for name in sys.modules if name.startswith("anytouch_jax.")]))
+"""
+
+
+def test_a_run_on_a_manifest_loads_no_module_of_a_ring(world, tmp_path):
+    paths = (TESTS.parent / "src", TESTS / "support")
+    done = subprocess.run(
+        [sys.executable, "-c", TRAINED, str(world), str(tmp_path / "r")],
+        capture_output=True,
+        text=True,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(map(str, paths))},
+        timeout=900,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    loaded = json.loads(done.stdout.splitlines()[-1])
+    assert "anytouch_jax.train.loop" in loaded
+    assert [name for name in loaded if name.split(".")[1] in RINGS] == []
+
+
+def test_every_source_of_batches_has_the_interface_that_training_uses():
+    members = ("steps_per_epoch", "trained_sensors", "examples", "stream")
+    for door in doors.BATCHES.values():
+        kind = doors.enter(door)
+        assert all(hasattr(kind, name) for name in (*members, "train_tokenizer"))
+    assert all(hasattr(Loader, name) for name in members)

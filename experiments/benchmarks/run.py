@@ -21,7 +21,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "src"))
 import jax
 
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate.statistics import markdown_table, plain
+from anytouch_jax.evaluate.tables import markdown_table, plain
 from anytouch_jax.train.progress import to_stderr as log
 from experiments.benchmarks import machine, speed
 from experiments.benchmarks.variants import variants_of

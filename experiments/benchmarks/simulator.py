@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from anytouch_jax.evaluate.statistics import plain
+from anytouch_jax.evaluate.tables import plain
 from anytouch_jax.sim import endless
 from anytouch_jax.sim.contact.mechanics import Fidelity
 from anytouch_jax.sim.endless import CAMERAS, Sampling, SimulatedTouches, World

@@ -18,7 +18,7 @@ import jax
 import numpy as np
 
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate.statistics import plain
+from anytouch_jax.evaluate.tables import plain
 from anytouch_jax.train.step import merge
 from experiments.benchmarks import machine
 from experiments.benchmarks.variants import BASELINE, Program, Variant, cold, compiled, variants_of

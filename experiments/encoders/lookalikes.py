@@ -19,7 +19,7 @@ from anytouch_jax.encoder.embed import embed_rows
 from anytouch_jax.encoder.encoder import Encoder
 from anytouch_jax.evaluate import retrieval
 from anytouch_jax.evaluate.feature_cache import background_difference
-from anytouch_jax.evaluate.statistics import plain
+from anytouch_jax.evaluate.tables import plain
 from anytouch_jax.train.progress import silent
 from experiments.benchmarks import machine
 from experiments.real.run import UNTRAINED, load

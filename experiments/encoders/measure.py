@@ -28,10 +28,11 @@ import numpy as np
 from anytouch_jax.batch import FieldBatch
 from anytouch_jax.config import Config, SimulatedConfig, parse_json
 from anytouch_jax.data.background.dots import DotFlow
+from anytouch_jax.fields.loss import LEAST_FORCE, TOUCHED, field_terms
 from anytouch_jax.fields.measure import Measure, Scale
 from anytouch_jax.fields.outputs import FORCE, LENGTH, TORQUE, FieldOutput
 from anytouch_jax.nn.functional import build
-from anytouch_jax.objectives import LEAST_FORCE, TOUCHED, field_terms, normalise_touch
+from anytouch_jax.objectives import normalise_touch
 from anytouch_jax.sim import endless, scene
 from anytouch_jax.sim.batches import FIELDS, field_batch, moved_gel
 from anytouch_jax.train.loop import fit

@@ -27,7 +27,8 @@ from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder.embed import run_in_batches
 from anytouch_jax.encoder.encoder import Encoder
 from anytouch_jax.evaluate import heads
-from anytouch_jax.evaluate.statistics import mean_interval, plain
+from anytouch_jax.evaluate.statistics import mean_interval
+from anytouch_jax.evaluate.tables import plain
 from anytouch_jax.objectives import normalise_touch
 from experiments.benchmarks import machine
 from experiments.real.run import load

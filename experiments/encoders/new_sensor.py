@@ -69,7 +69,7 @@ def device_touches(key: Any, world: Any, unit: Any, sampling: Sampling) -> Any:
     )
 
 
-def adapted_to(
+def adapted_to(  # noqa: PLR0913, what a study varies
     encoder: Encoder,
     pictures: list[np.ndarray],
     gel: np.ndarray,

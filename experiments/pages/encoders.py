@@ -100,8 +100,7 @@ def motion(folder: Path) -> Page:
         ]
         findings.append(
             f"`{name}`: the head names {own[0][2].mean:.0f} % of turns of new objects. A linear "
-            "probe on "
-            f"the mean token names {100 * record['pooled']:.0f} %."
+            f"probe on the mean token names {100 * record['pooled']:.0f} %."
         )
         rows += own
     answer = "A small head on the patch tokens names this share of turns of new objects."
@@ -212,8 +211,8 @@ def new_sensor(folder: Path) -> Page:
         refused = "" if steps else " (refused: the universal tokens stay)"
         gains.append(
             f"{key}: {found['universal'].mean:.0f} % with universal tokens, "
-            f"{found['adapted'].mean:.0f} % "
-            f"adapted{refused}, {found['own'].mean:.0f} % with its own."
+            f"{found['adapted'].mean:.0f} % adapted{refused}, {found['own'].mean:.0f} % with its "
+            "own."
         )
     return Page("new_sensor", [rows], gains)
 

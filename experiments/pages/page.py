@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from anytouch_jax.evaluate.statistics import markdown_table, without_html
+from anytouch_jax.evaluate.tables import markdown_table, without_html
 from experiments.values import Value
 
 RECORDS = tomllib.loads(Path(__file__).with_name("pages.toml").read_text(encoding="utf-8"))

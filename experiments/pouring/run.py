@@ -15,7 +15,7 @@ from typing import Annotated, Any
 from anytouch_jax.config.parsing import Count, Range, Seed
 from anytouch_jax.encoder.encoder import Encoder, load_encoder
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate.statistics import markdown_table
+from anytouch_jax.evaluate.tables import markdown_table
 from anytouch_jax.files import atomic_write
 from anytouch_jax.train.mesh import enable_compilation_cache
 from anytouch_jax.train.progress import to_stderr as log

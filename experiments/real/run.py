@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from anytouch_jax.encoder.encoder import Encoder, load_encoder, random_encoder
-from anytouch_jax.evaluate.statistics import plain
+from anytouch_jax.evaluate.tables import plain
 from experiments.benchmarks import machine
 from experiments.real import features, recordings, scores, training
 from experiments.records import write_record

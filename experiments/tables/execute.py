@@ -63,9 +63,8 @@ def check_results(leaves: Sequence[Leaf], out: Path) -> None:
             continue
         raise UserError(
             f"{out} holds results of {theirs['question']} of {what}: give a new folder, for "
-            "example "
-            f"make experiments OUT=runs/study, or remove the lines of {theirs['question']} to run "
-            "them again"
+            f"example make experiments OUT=runs/study, or remove the lines of {theirs['question']} "
+            "to run them again"
         )
 
 

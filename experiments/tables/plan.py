@@ -138,7 +138,8 @@ class Training:
     def key(self) -> str:
         """The name of its run folder: equal trainings have equal keys, and others never."""
         text = repr(chosen(self.config)) + (self.init.key if self.init else "")
-        return f"stage{self.config.stage}-seed{self.config.run.seed}-{hashlib.sha256(text.encode()).hexdigest()[:10]}"
+        digest = hashlib.sha256(text.encode()).hexdigest()[:10]
+        return f"stage{self.config.stage}-seed{self.config.run.seed}-{digest}"
 
     @property
     def chain(self) -> tuple[Training, ...]:

@@ -198,8 +198,8 @@ def check_objects(size: Size) -> None:
                 least = min(other.touches for other in plan.scenes(size) if other.seed == one.seed)
                 raise UserError(
                     f"the object {thing.name} would be in {before} of {name} and in {split} of "
-                    f"{one.name}: give both "
-                    f"the same objects, for example --set objects={min(size.objects, least)}"
+                    f"{one.name}: give both the same objects, for example --set "
+                    f"objects={min(size.objects, least)}"
                 )
 
 

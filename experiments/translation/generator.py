@@ -192,8 +192,7 @@ class Generator:
         if images.dtype != np.uint8 or images.shape[1:] != (side, side, 3):
             raise UserError(
                 f"images must be uint8 RGB of {side} x {side} pixels, not {images.dtype} "
-                f"{images.shape}; "
-                "data.transforms.touch_evaluation resizes them"
+                f"{images.shape}; data.transforms.touch_evaluation resizes them"
             )
         return run_in_batches(partial(_program(nameless(self.design)), self.params), images)
 

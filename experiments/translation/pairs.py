@@ -61,8 +61,7 @@ def find_pairs(manifest: Manifest, source: str, target: str) -> Split:
         if both:
             raise UserError(
                 f"object {both[0]!r} is in the splits {name} and test (and {len(both) - 1} "
-                "others): "
-                "test pairs must be of objects never seen; move its rows to one split"
+                "others): test pairs must be of objects never seen; move its rows to one split"
             )
     return Split(train, val, test)
 
@@ -73,8 +72,8 @@ def _pairs(manifest: Manifest, source: str, target: str, split: str) -> Pairs:
     if not shared and split != "val":
         raise UserError(
             f"split {split} has no frame of one touch felt by both {source} and {target}; give "
-            "fine-aligned data "
-            f"(anytouch data simulate --grade fine --units one --sensors {source},{target})"
+            "fine-aligned data (anytouch data simulate --grade fine --units one --sensors "
+            f"{source},{target})"
         )
     return Pairs(*(np.array([rows[key] for key in shared], np.int64) for rows in (first, second)))
 
@@ -97,8 +96,8 @@ def _frames(manifest: Manifest, sensor: str, split: str) -> dict[tuple[int, int]
         if key in result:
             raise UserError(
                 f"{manifest.where(row)}: {sensor} felt frame {key[1]} of touch "
-                f"{manifest.value(row, 'touch')!r} twice "
-                f"(row {manifest.number[result[key]]}); keep one unit of it"
+                f"{manifest.value(row, 'touch')!r} twice (row {manifest.number[result[key]]}); "
+                "keep one unit of it"
             )
         result[key] = row
     return result

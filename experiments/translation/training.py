@@ -73,7 +73,7 @@ class State(NamedTuple):
     critic_moments: Any
 
 
-def fit(
+def fit(  # noqa: PLR0913, the pairs, their names and the options of a training
     encoder: Encoder | None,
     images: np.ndarray,
     targets: np.ndarray,

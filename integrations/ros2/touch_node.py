@@ -1,10 +1,16 @@
-"""A ROS 2 node of a live camera: /touch/features, /touch/contact, /touch/wrench (N, N m) and
-/touch/points (m).
+"""A ROS 2 node of a live camera: features, contact, force and points of touch.
 
-ros2 run needs a package. This file runs alone: python integrations/ros2/touch_node.py --ros-args -p
-sensor:=digit Wrench and points need an encoder that measures. Their frame is the parameter frame: x
-to the right of the picture, y down, z into the gel. The wrench is that of the object on the gel,
-about the centre of pressure.
+It publishes /touch/features, /touch/contact, /touch/wrench (N, N m) and /touch/points (m).
+
+ros2 run needs a package. This file runs alone:
+
+    python integrations/ros2/touch_node.py --ros-args -p sensor:=digit
+
+Wrench and points need an encoder that measures. Their frame is the parameter frame, the optical
+frame of the camera (REP 103), which is right-handed: x to the right of the picture, y down, z away
+from the camera, towards the object. The wrench is that of the object on the gel, about the centre
+of pressure: a press has a negative z. The surface of the gel lies at z = 0, and at negative z where
+it is pressed.
 """
 
 import contextlib
@@ -21,15 +27,27 @@ from anytouch_jax.data.images import decode
 from anytouch_jax.encoder.linear_head import ContactGate
 from anytouch_jax.live.stream import open_source, stream
 
+PARAMETERS = {
+    "model": "anytouch-tiny",
+    "camera": "0",
+    "sensor": "digit",
+    "background": "",
+    "width_mm": "0",
+    "frame": "touch",
+}
+
 
 def wrench(fields, header: Header) -> WrenchStamped:
-    x, y, z = map(float, fields.force[0])
+    x, y, into_the_gel = map(float, fields.force[0])
+    # The gel lies between the camera and the object, so into the gel is towards the camera.
+    z = -into_the_gel
+    # The torque turns from x to y, which is about z.
     turn = Vector3(x=0.0, y=0.0, z=float(fields.torque[0]) / 1000)
     return WrenchStamped(header=header, wrench=Wrench(force=Vector3(x=x, y=y, z=z), torque=turn))
 
 
 def cloud(fields, header: Header) -> PointCloud2:
-    points = fields.points()[0].astype("<f4") / 1000
+    points = fields.points()[0].astype("<f4") / 1000  # mm to m
     axes = [
         PointField(name=name, offset=4 * place, datatype=PointField.FLOAT32, count=1)
         for place, name in enumerate("xyz")
@@ -48,63 +66,73 @@ def cloud(fields, header: Header) -> PointCloud2:
     )
 
 
-def main() -> None:
-    rclpy.init()
-    # camera:=0 is a number for ROS
-    node = Node("touch")
+def parameters(node: Node) -> dict[str, str]:
+    """Declare the parameters and return their values as text."""
+    # camera:=0 is a number for ROS, and a word for us.
     any_type = ParameterDescriptor(dynamic_typing=True)
-    values = {
+    return {
         name: str(node.declare_parameter(name, default, any_type).value)
-        for name, default in (
-            ("model", "anytouch-tiny"),
-            ("camera", "0"),
-            ("sensor", "digit"),
-            ("background", ""),
-            ("width_mm", "0"),
-            ("frame", "touch"),
-        )
+        for name, default in PARAMETERS.items()
     }
+
+
+def publishers(node: Node) -> dict:
+    """Return what publishes each kind of message by its name. Only the newest is kept."""
     kinds = {
         "features": Float32MultiArray,
         "contact": Bool,
         "wrench": WrenchStamped,
         "points": PointCloud2,
     }
-    # newest
-    send = {
+    return {
         name: node.create_publisher(kind, f"touch/{name}", 1).publish
         for name, kind in kinds.items()
     }
+
+
+def frames_of(values: dict[str, str]):
+    """Open the camera and the encoder, and return the embedded frames."""
     encoder = at.load_encoder(values["model"])
-    (source, live) = open_source(values["camera"])
+    source, live = open_source(values["camera"])
     gel = decode(values["background"]) if values["background"] else None
-    # without a picture it estimates one from the frames
+    # Without a picture of the gel, one is estimated from the frames.
     preprocess = at.Preprocess(encoder, gel)
-    gate = ContactGate(preprocess, values["sensor"])
-    row = encoder.sensor_row(values["sensor"])
-    width = float(values["width_mm"]) or None
-    length = encoder.config.model.frames if encoder.measures else 1
-    measure = encoder.measure_of(values["sensor"], gel, width) if encoder.measures else None
-    frames = stream(
+    length = 1
+    measure = None
+    if encoder.measures:
+        # Shear and slip are those from frame to frame, so they need a clip.
+        length = encoder.config.model.frames
+        width = float(values["width_mm"]) or None
+        measure = encoder.measure_of(values["sensor"], gel, width)
+    return stream(
         encoder,
         source,
         preprocess,
         live=live,
-        sensor=row,
-        contact=gate,
+        sensor=encoder.sensor_row(values["sensor"]),
+        contact=ContactGate(preprocess, values["sensor"]),
         frames=length,
         measure=measure,
     )
+
+
+def main() -> None:
+    rclpy.init()
+    node = Node("touch")
+    values = parameters(node)
+    send = publishers(node)
+    frames = frames_of(values)
     with contextlib.suppress(KeyboardInterrupt), contextlib.closing(frames):
         for frame in frames:
-            if not rclpy.ok():  # Ctrl-C has ended ROS, which then refuses to publish
+            # Ctrl-C has ended ROS, which then refuses to publish.
+            if not rclpy.ok():
                 break
             send["features"](Float32MultiArray(data=frame.values.tolist()))
-            if frame.contact == frame.contact:  # NaN without a background: contact is unknown
+            # NaN without a background: contact is unknown, and nothing is said.
+            if frame.contact == frame.contact:
                 send["contact"](Bool(data=bool(frame.contact)))
-            if (
-                frame.fields is not None and frame.fields.force is not None
-            ):  # None: nobody knows the width in mm
+            # Force is None if nobody knows the mm that the picture shows.
+            if frame.fields is not None and frame.fields.force is not None:
                 header = Header(stamp=node.get_clock().now().to_msg(), frame_id=values["frame"])
                 send["wrench"](wrench(frame.fields, header))
                 send["points"](cloud(frame.fields, header))

@@ -1,7 +1,8 @@
-"""Features, contact and force of a live camera over a Unix socket: one JSON line a frame, without
-ROS.
+"""Features, contact and force of a live camera over a Unix socket: one JSON line a frame.
 
-python integrations/unix_socket/touch_socket.py 0 digit /tmp/touch.sock gel.png
+It needs no ROS:
+
+    python integrations/unix_socket/touch_socket.py 0 digit /tmp/touch.sock gel.png
 """
 
 import argparse
@@ -11,6 +12,20 @@ import json
 import socket
 from pathlib import Path
 from typing import Any
+
+
+def line_of(frame: Any) -> dict[str, Any]:
+    """Return what is sent of a frame. What is unknown is None."""
+    line = {"frame": frame.number, "time": frame.time, "features": frame.values.tolist()}
+    is_known = frame.contact == frame.contact  # NaN is unknown
+    line["contact"] = bool(frame.contact) if is_known else None
+    if frame.estimated:
+        line["background"] = "estimated"
+    if frame.fields is not None:
+        # Force in N, depth in mm and others, with deviations. x is to the right of the picture, y
+        # down, and force_z into the gel. Slip is None where nothing touches.
+        line["fields"] = frame.fields.summary()
+    return line
 
 
 def serve(embedded: Any, path: str) -> None:
@@ -36,44 +51,47 @@ def serve(embedded: Any, path: str) -> None:
             with contextlib.suppress(BlockingIOError):
                 clients.append(stack.enter_context(server.accept()[0]))
                 clients[-1].setblocking(False)
-            line = {"frame": frame.number, "time": frame.time, "features": frame.values.tolist()}
-            # NaN is unknown
-            line["contact"] = None if frame.contact != frame.contact else bool(frame.contact)
-            line |= {"background": "estimated"} if frame.estimated else {}
-            if frame.fields is not None:  # force in N, depth in mm and others, with deviations
-                line["fields"] = frame.fields.summary()
+            data = json.dumps(line_of(frame)).encode() + b"\n"
             for client in list(clients):
                 try:
-                    client.sendall(json.dumps(line).encode() + b"\n")
+                    client.sendall(data)
                 except OSError:
                     clients.remove(client)
                     client.close()
 
 
-if __name__ == "__main__":
+def main() -> None:
     import anytouch_jax as at
     from anytouch_jax.data.images import decode
     from anytouch_jax.encoder.linear_head import ContactGate
     from anytouch_jax.live.stream import open_source, stream
 
     parser = argparse.ArgumentParser(description=__doc__)
-    for name, count in {"camera": None, "sensor": None, "address": None, "background": "?"}.items():
-        parser.add_argument(name, nargs=count)
+    parser.add_argument("camera")
+    parser.add_argument("sensor")
+    parser.add_argument("address")
+    parser.add_argument("background", nargs="?")
     given = parser.parse_args()
     encoder = at.load_encoder("anytouch-tiny")
-    (source, live) = open_source(given.camera)
+    source, live = open_source(given.camera)
     gel = given.background and decode(given.background)
-    # without a gel it estimates one
+    # Without a picture of the gel, one is estimated from the frames.
     preprocess = at.Preprocess(encoder, gel)
-    row = encoder.sensor_row(given.sensor)
-    gate = ContactGate(preprocess, given.sensor)
-    more = {}
+    measured = {}
     if encoder.measures:
-        more = {
-            "measure": encoder.measure_of(given.sensor, gel),
-            "frames": encoder.config.model.frames,
-        }
-    serve(
-        stream(encoder, source, preprocess, live=live, sensor=row, contact=gate, **more),
-        given.address,
+        measured["measure"] = encoder.measure_of(given.sensor, gel)
+        measured["frames"] = encoder.config.model.frames
+    frames = stream(
+        encoder,
+        source,
+        preprocess,
+        live=live,
+        sensor=encoder.sensor_row(given.sensor),
+        contact=ContactGate(preprocess, given.sensor),
+        **measured,
     )
+    serve(frames, given.address)
+
+
+if __name__ == "__main__":
+    main()

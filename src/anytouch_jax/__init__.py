@@ -7,7 +7,9 @@ from importlib import import_module
 from typing import Any
 
 _HOMES = {
-    "config": "Config DataConfig LossConfig ModelConfig OptimConfig RunConfig from_json preset to_json",
+    "config": (
+        "Config DataConfig LossConfig ModelConfig OptimConfig RunConfig from_json preset to_json"
+    ),
     "errors": "UserError",
     "batch": "AlignBatch MatchBatch Stage2Batch TouchBatch",
     "nn.functional": "Net build",
@@ -21,7 +23,7 @@ _HOMES = {
     "sim.recorder": "simulate_touch",
     "evaluate.heads": "ProbeHead",
     "evaluate.probing": "leave_groups_out probe_benchmark probe_features probe_label probe_tasks",
-    "data.background.rule": "untouched_gel",
+    "data.background.rule": "estimate_background",
     "data.loading.loader": "Loader",
     "data.manifest.manifest": "Manifest",
     "weights.registry": "list_encoders",
@@ -40,11 +42,18 @@ _HOME = {
 } | _ALIASES
 
 __all__ = sorted(_HOME)
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 
 
 def __getattr__(name: str) -> Any:
     if name not in _HOME:
+        # Imported here, because only an old name or a mistake needs it. `from anytouch_jax import
+        # renamed` would ask this function for it.
+        renamed = import_module("anytouch_jax.renamed")
+        if name in renamed.NAMES:
+            new = renamed.NAMES[name]
+            renamed.warn(f"anytouch_jax.{name}", f"anytouch_jax.{new}")
+            return __getattr__(new)
         raise AttributeError(f"module 'anytouch_jax' has no attribute {name!r}")
     module, attribute = _HOME[name]
     return getattr(import_module(f"anytouch_jax.{module}"), attribute)

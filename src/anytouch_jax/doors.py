@@ -27,24 +27,31 @@ class Door(NamedTuple):
 WEIGHTS = {
     "family": Door("zoo.families:load_family"),
     "family encoder": Door("zoo.encoder:family_encoder"),
+    "image encoder": Door("zoo.start:touch_of_photographs"),
     "torch": Door("zoo.torch_file:read_torch"),
+}
+# What reads sensor.json of a fitted sensor, a folder NAME.sensor.
+SENSORS = {
+    "fitted": Door("sim.sensing.own:read_numbers"),
 }
 # Sources of training batches, by the word of --data. Each has the interface of `batch.BatchSource`.
 BATCHES = {
-    "simulated": Door("sim.batches:SimulatedLoader", "sim"),
+    "simulated": Door("sim.batches:SimulatedLoader"),
 }
-# Heads beside the embedding: what builds their module, their loss and what they measure.
+# Heads beside the embedding. Each is a `nn.heads.Head`; its loss is a row of OBJECTIVES.
 HEADS = {
     "fields": Door("fields.head:HEAD"),
+    "fields measure": Door("fields.measure:measure_of"),
+    "fields units": Door("fields.units:describe_units"),
 }
-# Further terms of the training objectives, weighted by `objective.terms`.
+# Further terms of the loss, weighted by `objective.terms`. Each is an `objectives.Objective`.
 OBJECTIVES = {
-    "fields": Door("fields.loss:field_terms"),
+    "fields": Door("fields.loss:OBJECTIVE"),
 }
 # What computes the features of touch instead of XLA.
 ENGINES = {
-    "cached": Door("export.export:cached_export"),
-    "onnx": Door("export.export:load", "engines"),
+    "cached": Door("export.cache:cached_export"),
+    "onnx": Door("export.encoder:load_engine", "engines"),
 }
 
 
@@ -59,7 +66,12 @@ def enter(door: Door) -> Any:
     except ModuleNotFoundError as error:
         if not door.extra or (error.name or "").startswith("anytouch_jax"):
             raise
-        raise UserError(
-            f"{module} needs the package {error.name}, which is not installed: "
-            f'pip install "anytouch_jax[{door.extra}]"'
-        ) from None
+        raise lacking(module, error.name or "", door.extra) from None
+
+
+def lacking(what: str, package: str, extra: str) -> UserError:
+    """Return the error of a package that is not installed, with the command that installs it."""
+    return UserError(
+        f"{what} needs the package {package}, which is not installed: "
+        f'pip install "anytouch_jax[{extra}]"'
+    )

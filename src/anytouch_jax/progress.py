@@ -1,59 +1,52 @@
 """Progress bars with the time left, on a terminal."""
 
+from __future__ import annotations
+
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sized
 from contextlib import contextmanager
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
+
+if TYPE_CHECKING:  # rich takes 0.1 s to import, and short work shows no bar
+    from rich.progress import Progress
 
 Item = TypeVar("Item")
 WAIT = 3.0  # seconds without a bar: shorter work shows none
-_display: Any = None  # of the outermost bar that is open
+# Of the outermost bar that is open. rich allows one live display, so an inner bar joins it.
+_display: Progress | None = None
 
 
 @contextmanager
 def bar(total: int | None, words: str) -> Iterator[Callable[[int], None]]:
-    """Give a function for the number of items that are done.
+    """Give a function for the number of items that are done, which moves a bar.
 
-    It moves a bar once the work has taken 3 s.
+    The bar appears once the work has taken WAIT seconds. Nothing is shown where the error stream
+    is no terminal. A bar inside another one is shown below it.
 
-    `words` names the items. Nothing is shown where the error stream is no terminal. Without a
-    `total` there is no time left. A bar inside another one is shown below it.
+    Args:
+        total: Number of items, None if it is unknown. Then no time left is shown.
+        words: Names the items, as in "frames written".
     """
     global _display
     if not sys.stderr.isatty():
         yield lambda done: None
         return
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeRemainingColumn,
-    )
-
-    display = outer = _display
-    if display is None:
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeRemainingColumn(),
-        )
-        display = _display = Progress(
-            *columns, console=Console(stderr=True), redirect_stdout=sys.stdout.isatty()
-        )
+    outer = _display
+    display = _new_display() if outer is None else outer
+    _display = display
     begun = time.monotonic()
     task = display.add_task(words, total=total, visible=False)
 
     def advance(done: int | None = None) -> None:
-        if is_long := time.monotonic() - begun >= WAIT:
+        is_long = time.monotonic() - begun >= WAIT
+        if is_long:
             display.start()
         display.update(task, completed=done, visible=is_long)
 
-    timer = threading.Timer(WAIT, advance)  # the first item may take long
+    # The first item alone may take longer than WAIT.
+    timer = threading.Timer(WAIT, advance)
     timer.daemon = True
     timer.start()
     try:
@@ -68,12 +61,38 @@ def bar(total: int | None, words: str) -> Iterator[Callable[[int], None]]:
             display.remove_task(task)
 
 
+def _new_display() -> Progress:
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+    )
+
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        console=Console(stderr=True),
+        # Lines that are printed meanwhile go above the bar, unless they go to a file.
+        redirect_stdout=sys.stdout.isatty(),
+    )
+
+
 def tracked(items: Iterable[Item], words: str, total: int | None = None) -> Iterator[Item]:
     """Yield items, and show how many are done and the time left, as `bar` does.
 
-    `total` is the length of a sequence.
+    Args:
+        items: What to go through.
+        words: Names the items.
+        total: Their number, for items without a length.
     """
-    with bar(len(items) if isinstance(items, Sized) else total, words) as advance:
+    if isinstance(items, Sized):
+        total = len(items)
+    with bar(total, words) as advance:
         for done, item in enumerate(items, 1):
             yield item
             advance(done)

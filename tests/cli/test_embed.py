@@ -11,7 +11,7 @@ from runs import run_config, train
 import anytouch_jax as at
 from anytouch_jax.cli.arguments import DEFAULT
 from anytouch_jax.encoder.linear_head import load_head
-from anytouch_jax.weights import registry
+from anytouch_jax.weights import load, registry
 
 
 @pytest.fixture
@@ -89,6 +89,25 @@ def test_clips_of_a_manifest_and_of_a_video(embed, tmp_path, world):
         3,
         4,
     ]
+
+
+def test_a_stack_is_embedded_frame_by_frame(embed, tmp_path, mistake, tiny_run):
+    frames = np.random.default_rng(0).integers(0, 256, (5, 32, 32, 3), np.uint8)
+    (tmp_path / "folder").mkdir()
+    for number, frame in enumerate(frames):
+        cv2.imwrite(str(tmp_path / "folder" / f"{number}.png"), frame[..., ::-1])
+    np.save(tmp_path / "stack.npy", frames)
+    np.savez(tmp_path / "stack.npz", rgb=frames)
+    for length in (1, 3):
+        words = ("--sensor", "digit", "--frames", length)
+        wanted = embed(tmp_path / "folder", *words)
+        for name in ("stack.npy", "stack.npz"):
+            found = embed(tmp_path / name, *words)
+            np.testing.assert_allclose(found["features"], wanted["features"], atol=1e-6)
+            assert found["key/frame_index"].tolist() == list(range(length - 1, 5))
+    np.savez(tmp_path / "two.npz", left=frames, right=frames)
+    out = ("--out", tmp_path / "f.npz")
+    assert "left" in mistake("embed", "--model", tiny_run, "--data", tmp_path / "two.npz", *out)
 
 
 def test_a_bad_picture_of_a_folder_is_named_or_left_out(embed, mistake, tmp_path, world, tiny_run):
@@ -201,6 +220,22 @@ def test_mistakes_are_named_before_the_encoder_is_loaded(
     out = [] if "--out" in words else ["--out", "f.npz"]
     sentence = mistake("embed", "--model", "nowhere", "--data", *words, *out)
     assert all(name in sentence for name in named), sentence
+
+
+@pytest.mark.parametrize("command", ["embed", "measure", "stream"])
+@pytest.mark.parametrize("stored", ["run", "package"])
+def test_a_misspelt_sensor_is_named_before_the_encoder_is_loaded(
+    mistake, tmp_path, tiny_run, monkeypatch, command, stored
+):
+    def loaded(*_, **__):
+        raise AssertionError("loading takes seconds")
+
+    monkeypatch.setattr(load, "load_model", loaded)
+    film = write_film(tmp_path / "film.avi", [np.zeros((32, 32, 3), np.uint8)])
+    model = ["--model", tiny_run] if stored == "run" else []
+    words = (command, *model, "--data", film, "--out", tmp_path / "f.npz", "--sensor")
+    assert "did you mean digit" in mistake(*words, "DIGIT")
+    assert "sensor.json" in mistake(*words, "gone.sensor")
 
 
 @pytest.fixture(scope="module")

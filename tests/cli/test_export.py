@@ -59,7 +59,7 @@ def test_the_file_for_jax_gives_the_features_of_the_live_model(
     def differs(*_, **__):
         raise CheckError("the artefact differs")
 
-    monkeypatch.setattr(export, "export", differs)
+    monkeypatch.setattr(export, "export_with", differs)
     done = anytouch("export", "--model", tiny_run, "--out", tmp_path / "m.bin")
     assert done.status == 1 and "differs" in done.err
 

@@ -11,8 +11,8 @@ from touch_world import make_touches
 
 from anytouch_jax import load_encoder
 from anytouch_jax.export import export
-from tests.weights import test_families as forms
 from tests.weights.test_start import mae
+from tests.zoo import test_families as forms
 
 OTHERS = ROOT / "tests" / "parity" / "golden_others"
 # small files of the other families: title, (width, depth, heads, mlp), patch, what else differs,
@@ -136,7 +136,8 @@ def test_a_run_starts_from_a_family_whose_form_and_export_are_known(
         "--model.image-size 28 --model.patch 7 --model.touch.width 16 --model.touch.depth 2 "
         "--model.touch.heads 2"
     )
-    size += " --model.touch.mlp 32 --model.norm-eps 1e-12 --model.decoder.width 8 --model.decoder.depth 1"
+    size += " --model.touch.mlp 32 --model.norm-eps 1e-12"
+    size += " --model.decoder.width 8 --model.decoder.depth 1"
     words = [
         "--run",
         tmp_path / "run",

@@ -1,10 +1,14 @@
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from touch_world import make_touches
 
+import anytouch_jax as at
 from anytouch_jax.cli.app import main
+from anytouch_jax.cli.inputs import choose_gel
+from anytouch_jax.data.images import encode
 from anytouch_jax.encoder import embed
 
 
@@ -78,7 +82,9 @@ def test_a_mistake_is_one_sentence(touches, mistake, tmp_path, world, monkeypatc
     assert "s1" in mistake("report", *words) and not (tmp_path / "report").exists()
 
 
-def test_stored_touches_are_searched_by_a_frame(anytouch, mistake, tmp_path, tiny_run, world):
+def test_stored_touches_are_searched_by_a_frame(
+    anytouch, mistake, monkeypatch, tmp_path, tiny_run, world
+):
     index = tmp_path / "index.npz"
     assert anytouch("embed", "--model", tiny_run, "--data", world, "--out", index).status == 0
     with np.load(index) as file:
@@ -94,3 +100,22 @@ def test_stored_touches_are_searched_by_a_frame(anytouch, mistake, tmp_path, tin
     assert "text tower" in mistake(*words, "a soft sponge")
     assert "--query" in mistake(*words[:-1])
     assert "--split" in mistake(*words, "x", "--split", "val")
+    monkeypatch.setattr(
+        "anytouch_jax.encoder.encoder.load_encoder", lambda _: pytest.fail("loaded")
+    )
+    assert "did you mean digit" in mistake(*words, world.parent / path, "--sensor", "DIGIT")
+
+
+def test_a_picture_of_the_index_is_no_other_sensor(tmp_path, capfd):
+    """Two of the package's examples differ by 13 grey levels or more from their own gels."""
+    encoder = SimpleNamespace(subtracts=True, needs_background=True)
+    touches = at.example_touches()
+    known = {f"{touch.sensor} {touch.press}": touch.background for touch in touches}
+    for touch in touches:
+        path = tmp_path / "query.png"
+        path.write_bytes(encode(touch.frame))
+        gel, what = choose_gel(encoder, None, path, known, "the index was made with")
+        said = capfd.readouterr().err
+        assert gel is not None and any(gel is one for one in known.values())
+        assert said == f"untouched gel: {what}\n" and "picture that the index was made with" in what
+        assert "head" not in said and "trust" not in said

@@ -1,10 +1,14 @@
+import contextlib
 import json
 import os
 import pkgutil
+import pty
+import re
 import shutil
 import signal
 import subprocess
 import sys
+import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,8 +19,11 @@ from runs import SIZES, read_metrics, run_config, saved_steps, train
 from toy_process import finish, free_address, spawn
 
 from anytouch_jax.cli import train as command
+from anytouch_jax.cli.app import main
+from anytouch_jax.cli.output import log
 from anytouch_jax.config import preset
 from anytouch_jax.train.mesh import make_mesh
+from anytouch_jax.train.progress import Record, progress
 
 
 def options_of(sizes: dict[str, object]) -> list[str]:
@@ -173,6 +180,135 @@ def test_a_termination_before_the_first_step_is_polite(
     assert signal.getsignal(signal.SIGTERM) is before
     assert {path.name for path in tmp_path.rglob("*") if path.is_file()} <= {"config.json", ".lock"}
     assert anytouch(*words, "--stop-after", 0).status == 0
+
+
+@pytest.mark.parametrize(
+    "place",
+    [
+        "anytouch_jax.data.manifest.manifest.read",
+        "anytouch_jax.weights.checkpoint.Checkpoints.latest",
+    ],
+)
+def test_ctrl_c_before_the_first_step_says_how_to_continue(
+    anytouch, tmp_path, world, monkeypatch, place
+):
+    module, _, name = place.rpartition(".")
+    owner = pkgutil.resolve_name(module)
+
+    def interrupted(*args, **options):
+        raise KeyboardInterrupt
+
+    words = ["train", "--data", world, "--run", tmp_path / "r", "--steps", 4, "--batch", 8, *SMALL]
+    with monkeypatch.context() as patch:
+        patch.setattr(owner, name, interrupted)
+        done = anytouch(*words)
+    last = done.err.splitlines()[-1]
+    assert done.status == 130 and "Ctrl-C before the first step" in last
+    assert str(tmp_path / "r") in last and "same command" in last
+
+
+@contextlib.contextmanager
+def terminal(monkeypatch):
+    """A terminal as the error stream; gives a list that has what was written, once it is closed."""
+    leader, follower = pty.openpty()
+    written = []
+
+    def read():
+        while chunk := _read(leader):
+            written.append(chunk.decode())
+
+    reader = threading.Thread(target=read, daemon=True)
+    reader.start()
+    with monkeypatch.context() as patch, os.fdopen(follower, "w") as stream:
+        patch.setenv("TERM", "xterm")
+        patch.setenv("COLUMNS", "100")
+        patch.setattr(sys, "stderr", stream)
+        yield written
+    # The last writer is gone, which ends the reader.
+    reader.join(10)
+    os.close(leader)
+
+
+def _read(descriptor: int) -> bytes:
+    try:
+        return os.read(descriptor, 1 << 16)
+    except OSError:  # the other end is closed
+        return b""
+
+
+def rows_of_terminal(text: str) -> list[str]:
+    """The rows that a terminal shows: each part between line feeds and carriage returns, plain."""
+    plain = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", text)
+    return [row.strip() for row in re.split(r"[\r\n]+", plain)]
+
+
+def test_a_sentence_beside_the_bar_has_a_line_of_its_own(monkeypatch):
+    with terminal(monkeypatch) as written, progress(0, 3, log) as advance:
+        for step in range(3):
+            advance({"step": step, "loss": 1.0, "samples_per_second": 5.0, "skipped_batches": 0})
+            log(f"sentence {step}")
+    rows = rows_of_terminal("".join(written))
+    assert [row for row in rows if "sentence" in row] == [f"sentence {step}" for step in range(3)]
+
+
+def test_ctrl_c_leaves_the_sentence_that_says_how_to_continue(tmp_path, world, monkeypatch):
+    real = Record.write
+
+    def write(record, step, numbers):
+        if step == 1:
+            signal.raise_signal(signal.SIGINT)
+        return real(record, step, numbers)
+
+    monkeypatch.setattr(Record, "write", write)
+    words = ["train", "--data", world, "--run", tmp_path / "r", "--steps", 9, "--batch", 8, *SMALL]
+    with terminal(monkeypatch) as written:
+        assert main([str(word) for word in words]) == 130
+    rows = [row for row in rows_of_terminal("".join(written)) if row]
+    assert rows[-1].startswith("stopped by SIGINT after step 3 and saved in")
+    assert rows[-1].endswith("the same command continues from here")
+    assert saved_steps(tmp_path / "r") == [3]
+
+
+NOT_WORDS = """
+import sys
+from anytouch_jax.cli.app import main
+status = main(sys.argv[1:])
+print(status, "jax" in sys.modules)
+"""
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (["--model.sensors", "DIGITT", "universal"], "did you mean digit"),
+        (["--simulated.sensors", "Digit"], "did you mean digit"),
+        (["--data.split", "trian"], "train, val, test"),
+        (["--objective.terms", "field", "1"], "no objective"),
+        (["--init", "gone"], "--init gone does not exist"),
+        (["--towers", "pretrained", "--clip-weights", "gone"], "--clip-weights gone does not"),
+        (["--data", "simulatd"], "Did you mean --data simulated?"),
+        (["--data", "gone.parquet"], "gone.parquet"),
+    ],
+)
+def test_wrong_words_are_refused_before_jax_is_loaded(words, named, world, tmp_path):
+    data = [] if "--data" in words else ["--data", str(world)]
+    done = subprocess.run(
+        [sys.executable, "-c", NOT_WORDS, "train", *data, "--run", str(tmp_path / "r"), *words],
+        capture_output=True,
+        text=True,
+        env=os.environ | {"PYTHONPATH": str(ROOT / "src")},
+        timeout=300,
+        check=False,
+    )
+    assert done.stdout.split() == ["2", "False"], done.stderr
+    assert named in done.stderr and len(done.stderr.strip().splitlines()) == 1
+
+
+def test_a_run_that_continues_does_not_need_its_start(anytouch, tmp_path, world, tiny_run):
+    shutil.copytree(tiny_run, tmp_path / "r")
+    words = ["--steps", 4, "--save-every", 4, "--batch", 8, *TINY_RUN, "--stop-after", 2]
+    done = anytouch("train", "--data", world, "--run", tmp_path / "r", "--init", "gone", *words)
+    assert done.status == 0 and "gone is not read" in done.err
 
 
 # The run is the same as that of one process, on whatever number of devices it continues.

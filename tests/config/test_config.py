@@ -4,6 +4,7 @@ from dataclasses import replace
 from itertools import product
 
 import pytest
+from places import ROOT
 from tiny_models import full_model
 
 from anytouch_jax.config import (
@@ -286,3 +287,9 @@ def test_a_retired_setting_with_an_effect_stops_a_run_but_not_an_encoder(change)
 def test_json_has_limits(text, words):
     with pytest.raises(ConfigError, match=words):
         parse_json(text)
+
+
+def test_the_pages_name_the_default_of_the_background():
+    pages = {name: (ROOT / "docs" / name).read_text() for name in ("train.md", "sensor.md")}
+    assert f"the default is `--data.background {DataConfig().background}`" in pages["train.md"]
+    assert "in training too" not in pages["sensor.md"]

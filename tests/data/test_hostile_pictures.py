@@ -11,7 +11,7 @@ from films import write_film
 from PIL import Image
 from refused import refused
 
-from anytouch_jax.data import images
+from anytouch_jax.data import images, picture_headers
 from anytouch_jax.data.images import ImageError, decode_bytes
 
 RGB = np.random.default_rng(0).integers(0, 256, (16, 24, 3), np.uint8)
@@ -64,7 +64,7 @@ def test_a_picture_that_would_take_minutes_is_refused(data, words, monkeypatch):
 
 
 def test_the_limit_of_scans_falls_with_the_size(monkeypatch):
-    monkeypatch.setattr(images, "MAX_CODED", 20 * (1 << 16))
+    monkeypatch.setattr(picture_headers, "MAX_CODED", 20 * (1 << 16))
     refused("more than 20 scans", decode_bytes, _many_scans(30), "x")
     hidden = (
         _many_scans(0)[:-2] + b"\xff\xfe\0\4\xff\xd9" + _many_scans(30)[len(_many_scans(0)) - 2 :]
@@ -158,7 +158,7 @@ def test_a_declared_size_beyond_the_limit_is_refused_before_it_is_unpacked(suffi
     if suffix == "tags.webp":  # another header
         data = _saved("webp", exif=b"Exif\0\0")
     assert decode_bytes(data, "x").shape == (16, 24, 3)
-    monkeypatch.setattr(images, "MAX_PIXELS", 16 * 24 - 1)
+    monkeypatch.setattr(picture_headers, "MAX_PIXELS", 16 * 24 - 1)
     monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was unpacked"))
     refused("it declares 24 x 16 pixels", decode_bytes, data, "x")
 

@@ -57,9 +57,7 @@ def test_flips_are_exact_mirrors_in_all_four_forms():
 
 
 def _blob(affine, key):
-    """Share of the picture, and place of the middle (share of the side from the picture's), of a
-    disc after a map.
-    """
+    """Area of a disc after a map, and its place from the middle, as fractions of the picture."""
     disc = cv2.circle(np.zeros((64, 64, 3), np.uint8), (32, 32), 10, (255, 255, 255), -1)
     out = t.touch_transform([disc], 64, _rng(key), replace(PLAIN, affine=affine))[0, ..., 0] / 255
     rows, columns = np.indices(out.shape)

@@ -126,7 +126,7 @@ def test_one_question_a_sequence_with_the_photograph_of_its_middle_frame(make, t
     assert "photograph" in _words(server.asked[0])
 
 
-def test_one_photograph_and_one_touch_by_two_sensors_are_asked_about_once_and_pictures_are_made_small(
+def test_one_photograph_or_touch_by_two_sensors_is_asked_about_once_with_small_pictures(
     make, tmp_path
 ):
     rows = [

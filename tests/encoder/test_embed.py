@@ -3,7 +3,7 @@ import pytest
 
 import anytouch_jax as at
 from anytouch_jax.config import SENSORS
-from anytouch_jax.encoder import embed as search
+from anytouch_jax.encoder import index as search
 from anytouch_jax.encoder.arrays import spread_lines
 from anytouch_jax.encoder.embed import load_index, run_in_batches
 from anytouch_jax.errors import UserError

@@ -3,8 +3,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from anytouch_jax.encoder import linear_head
-from anytouch_jax.encoder import linear_head as novelty
+from anytouch_jax.encoder import calibration, linear_head
+from anytouch_jax.encoder import calibration as novelty
 from anytouch_jax.encoder.linear_head import ContactGate
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import heads, splits
@@ -155,3 +155,83 @@ def test_contact_is_a_difference_from_the_untouched_gel():
     assert (gate_of(gel), gate_of(pressed)) == (0.0, 1.0)
     with pytest.raises(UserError, match="--background"):
         gate(np.zeros((80, 60, 3), np.uint8))
+
+
+@pytest.mark.parametrize("level", [0.5, 0.8, 0.9, 0.95])
+def test_the_limit_has_the_rank_of_split_conformal_prediction(level):
+    """With one row a group it is the score of rank ceil((n + 1) * level), or infinite beyond n."""
+    rng = np.random.default_rng(0)
+    for count in range(9, 102):
+        scores = rng.permutation(count).astype(float)
+        rank = int(np.ceil((count + 1) * level - 1e-9))
+        wanted = np.inf if rank > count else float(rank - 1)
+        assert novelty.conformal_limit(scores, np.arange(count), level) == wanted, count
+
+
+def test_frames_of_one_recording_count_once():
+    """Long recordings are the easy ones here: weights of frames would promise too much."""
+    rng = np.random.default_rng(0)
+    inside = []
+    for _ in range(200):
+        is_hard = rng.random(60) < 0.3
+        lengths = np.where(is_hard, 2, 80)
+        groups = np.repeat(np.arange(60), lengths)
+        scores = np.where(is_hard, 1.0, 0.0)[groups] + 0.1 * rng.random(len(groups))
+        new_is_hard = rng.random(40) < 0.3
+        new = np.where(new_is_hard, 1.0, 0.0) + 0.1 * rng.random(40)
+        inside.append(np.mean(new <= novelty.conformal_limit(scores, groups, 0.9)))
+    assert 0.87 < np.mean(inside) < 0.95
+    weights = novelty.group_weights(np.array(["a", "b", "b", "b", "b"]))
+    np.testing.assert_allclose(weights, [0.5, 0.125, 0.125, 0.125, 0.125])
+
+
+def test_the_temperature_is_that_of_recordings_not_of_frames():
+    """One recording of 4,000 confident frames, and 200 of one frame whose logits are too large."""
+    rng = np.random.default_rng(0)
+    logits = np.concatenate([rng.standard_normal((200, 3)), np.full((4000, 3), [9.0, 0, 0])])
+    p = novelty.probabilities(logits[:200])
+    drawn = (p.cumsum(1) < rng.random(200)[:, None]).sum(1)
+    y = np.concatenate([drawn, np.zeros(4000, int)])
+    logits[:200] *= 4
+    groups = np.concatenate([np.arange(200), np.full(4000, 200)])
+    assert novelty.fit_temperature(logits, y, groups) == pytest.approx(4, rel=0.35)
+
+
+def test_sets_of_a_head_hold_the_class_of_new_recordings_of_any_length():
+    rng = np.random.default_rng(3)
+    covered = []
+    alarms = []
+    for _ in range(6):
+        groups, parts = 200, []
+        for group in range(groups):
+            is_hard = rng.random() < 0.35
+            rows = 1 if is_hard else 20
+            x = rng.standard_normal(WIDTH) * (2.5 if is_hard else 0.3)
+            x = x + 2 * np.eye(WIDTH)[group % CLASSES]
+            parts.append((x + 0.05 * rng.standard_normal((rows, WIDTH)), group, rows))
+        x = np.concatenate([part for part, _, _ in parts]).astype(np.float32)
+        group = np.repeat([number for _, number, _ in parts], [rows for *_, rows in parts])
+        y = np.array(list("abcd"))[group % CLASSES]
+        known = group < 150
+        sensors = np.full(len(y), "digit")
+        head = calibrated(x[known], y[known], group[known], sensors[known], share=0.4)
+        seen = head.assess(x[~known])
+        truth = np.searchsorted(head.classes, y[~known])
+        inside = seen.in_set[np.arange(len(truth)), truth]
+        weights = novelty.group_weights(group[~known])
+        covered.append(np.average(inside, weights=weights))
+        alarms.append(np.average(seen.novel, weights=weights))
+    assert 0.86 < np.mean(covered) < 0.96, covered
+    assert 0.01 < np.mean(alarms) < 0.09, alarms
+
+
+@pytest.mark.parametrize("columns", [1, 5])
+def test_confidence_is_not_above_what_the_groups_support(columns):
+    """However sure the logits are; a temperature that is modest already stays."""
+    rng = np.random.default_rng(2)
+    groups = np.repeat(np.arange(7), 10)
+    logits = 50 * rng.standard_normal((70, columns))
+    found = calibration.modest_temperature(logits, groups, 0.05)
+    confidence = linear_head.probabilities(logits, found).max(1).mean()
+    assert found > 0.05 and confidence == pytest.approx(8 / 9, abs=1e-6)
+    assert calibration.modest_temperature(logits, groups, 2 * found) == 2 * found

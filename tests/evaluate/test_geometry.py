@@ -2,6 +2,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.stats import binomtest
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import statistics
@@ -9,6 +10,7 @@ from anytouch_jax.evaluate.plots import alignment, describe, silhouette, tsne, u
 from anytouch_jax.evaluate.statistics import (
     GroupSums,
     classification_sums,
+    fraction_interval,
     mean_interval,
     regression_sums,
 )
@@ -149,3 +151,28 @@ def test_values_from_sums() -> None:
     assert statistics._r2_of(sums) == pytest.approx(
         1 - 1.25 / np.sum((truth - 3) ** 2)
     ) and statistics._mae_of(sums) == pytest.approx(1.5 / 4)
+
+
+@pytest.mark.parametrize("right", [True, False])
+@pytest.mark.parametrize("count", [2, 7, 60])
+def test_an_interval_of_equal_groups_does_not_collapse(right: bool, count: int) -> None:
+    """All recordings right, or all wrong: the interval of Clopper and Pearson, whatever frames."""
+    for each in (1, 40):
+        groups = np.repeat(np.arange(count), each)
+        low, high = fraction_interval(np.full(count * each, right), groups)
+        exact = binomtest(count * right, count).proportion_ci(0.95, "exact")
+        assert (low, high) == pytest.approx((exact.low, exact.high), abs=1e-6)
+    one_wrong = np.arange(count) > 0
+    assert fraction_interval(one_wrong, np.arange(count)) == mean_interval(
+        one_wrong, np.arange(count)
+    )
+    # a difference that is 0 on every group stays 0
+    assert mean_interval(np.zeros(count), np.arange(count)) == (0.0, 0.0)
+
+
+def test_an_interval_of_one_group_is_none_and_seeds_are_no_trials() -> None:
+    assert fraction_interval(np.ones(9), np.zeros(9)) == (None, None)
+    groups = np.arange(10)
+    run = classification_sums(np.ones(10), groups)
+    scored = [statistics.scores([run] * seeds, [run] * seeds, False) for seeds in (1, 5)]
+    assert scored[0]["low"] == scored[1]["low"] == pytest.approx(0.025**0.1)

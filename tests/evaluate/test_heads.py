@@ -9,7 +9,7 @@ from task_world import blobs
 from anytouch_jax.encoder import embed as search
 from anytouch_jax.encoder import linear_head
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate import heads
+from anytouch_jax.evaluate import heads, logistic
 from anytouch_jax.evaluate.heads import GradientRecipe, ProbeHead, fit_head, linear_path
 
 FIT = slice(0, 500)
@@ -231,8 +231,8 @@ def test_the_optimum_is_scikit_learns(classes, penalty):
 def test_a_start_saves_steps_and_changes_nothing(monkeypatch):
     x, y = blobs()
     calls = []
-    plain = heads._log_loss
-    monkeypatch.setattr(heads, "_log_loss", lambda *a: calls.append(1) or plain(*a))
+    plain = logistic._log_loss
+    monkeypatch.setattr(logistic, "_log_loss", lambda *a: calls.append(1) or plain(*a))
     cold = next(heads.logistic_path(x, y, 4, [0.001]))
     took = len(calls)
     warm = next(heads.logistic_path(x, y, 4, [0.001], cold))

@@ -390,7 +390,7 @@ def test_a_label_probe_of_models_files_and_controls(touches, tiny_run, tmp_path)
     ("label", "options", "word"),
     [
         ("object", {}, "train"),
-        ("force", {}, "label.force"),
+        ("force", {"regression": "no"}, "label.force"),
         ("split", {}, "train"),
         ("hardness", {"controls": False}, "nothing"),
         ("hardness", {"leave_out": "sensor", "sensor": "digit"}, "digit"),
@@ -405,3 +405,22 @@ def test_a_label_that_cannot_be_probed_is_refused_before_the_work(
     )
     with pytest.raises(UserError, match=word):
         probe_label(**{"models": [], "data": [touches], "label": label, "log": str} | options)
+
+
+@pytest.mark.parametrize("option", ["group", "leave_out"])
+def test_recordings_of_the_page_give_a_head(touches, tiny_run, tmp_path, option):
+    """All rows are of split train: the head is fitted on all of them and calibrated by folds."""
+    known = manifests.read(touches)
+    rows = np.flatnonzero(known.text_column("split") == "train")
+    columns = {name: known.table[name].take(rows).to_pylist() for name in known.table.column_names}
+    data = touches.with_name(f"train_{option}.parquet")
+    manifests.write(manifests.from_columns(columns, data), data)
+    head = tmp_path / "head.npz"
+    said: list[str] = []
+    plain: dict[str, Any] = {"controls": False, "save": head, "log": said.append}
+    (result,) = probe_label([tiny_run], [data], "hardness", **{option: "sequence"}, **plain)
+    saved = load_head(head)
+    assert saved.calibration is not None and saved.label == "hardness"
+    assert sorted(saved.classes) == sorted(result.classes)
+    assert any("fitted on all rows" in line for line in said)
+    assert any("calibrated on" in line for line in said)

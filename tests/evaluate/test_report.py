@@ -19,13 +19,13 @@ from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.report import (
     LABELS,
     PIXELS,
-    RANDOM,
     VECTOR,
     Section,
     demo_report,
     write_report,
 )
-from anytouch_jax.evaluate.statistics import as_text, markdown_table
+from anytouch_jax.evaluate.statistics import RANDOM
+from anytouch_jax.evaluate.tables import as_text, markdown_table
 from anytouch_jax.weights import checkpoint
 
 NAMES = (RANDOM, "stage 1", "stage 2")
@@ -243,7 +243,7 @@ def test_a_report_that_fails_leaves_the_one_before(
     def fail(*args: Any) -> None:
         raise UserError("in the midst of it")
 
-    monkeypatch.setattr("anytouch_jax.evaluate.report._probes", fail)
+    monkeypatch.setattr("anytouch_jax.evaluate.report_features.probes_section", fail)
     with pytest.raises(UserError, match="in the midst of it"):
         demo_report(
             touched, tiny_run, later, folder, lambda _: None, touches=12, gallery_size=10, seed=1

@@ -160,9 +160,13 @@ def test_what_does_not_run_here_is_a_row_with_a_note():
 
 _BARE = """
 import sys
-for name in ("tyro", "pyarrow", "cv2", "matplotlib", "sklearn", "tokenizers", "safetensors", "taxim", "threadpoolctl"):
+for name in (
+    "tyro", "pyarrow", "cv2", "matplotlib", "sklearn", "tokenizers", "safetensors", "taxim",
+    "threadpoolctl",
+):
     sys.modules[name] = None  # an import of it fails
-sys.argv = "run.py embed --preset tiny --batch 1 --rounds 1 --peak-size 64 --out".split() + [{out!r}]
+words = "run.py embed --preset tiny --batch 1 --rounds 1 --peak-size 64 --out"
+sys.argv = [*words.split(), {out!r}]
 sys.path[:0] = [{root!r}, {root!r} + "/src"]
 import runpy
 runpy.run_path({script!r}, run_name="__main__")

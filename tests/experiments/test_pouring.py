@@ -204,7 +204,10 @@ def test_what_was_recorded_is_not_mixed_with_new_pictures(script, tmp_path):
 
 
 def test_a_policy_of_other_settings_is_not_written_over(script, tiny_run, tmp_path):
-    kept = '{"model": "%s", "target": 60.0, "demonstrations": 2, "seed": 0, "stills": false, "fine_tuned": %s}'
+    kept = (
+        '{"model": "%s", "target": 60.0, "demonstrations": 2, "seed": 0, "stills": false, '
+        '"fine_tuned": %s}'
+    )
     (tmp_path / "pour.json").write_text(kept % (tiny_run, "true"))
     logged = script(pour, "--model", tiny_run, "--demos", 2, "--out", tmp_path)
     assert logged.status == 2 and "(fine_tuned, markers)" in logged.err

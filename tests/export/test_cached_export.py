@@ -15,9 +15,9 @@ from tiny_models import touch_model
 from anytouch_jax.config import to_json
 from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.errors import CheckError, UserError
-from anytouch_jax.export import engines
-from anytouch_jax.export import export as cached_export
-from anytouch_jax.export.export import describes
+from anytouch_jax.export import cache, engines
+from anytouch_jax.export import export as exports
+from anytouch_jax.export.artefact import describes
 from anytouch_jax.files import cache_folder
 from anytouch_jax.nn.functional import build
 from anytouch_jax.weights import safetensors
@@ -85,9 +85,9 @@ def test_an_export_is_made_once_and_again_when_anything_that_decides_it_changes(
     tmp_path, monkeypatch
 ):
     made = []
-    honest = cached_export.export
+    honest = exports.export_with
     monkeypatch.setattr(
-        cached_export, "export", lambda *given, **more: (made.append(0), honest(*given, **more))[1]
+        exports, "export_with", lambda *given, **more: (made.append(0), honest(*given, **more))[1]
     )
 
     def features(path):
@@ -120,9 +120,7 @@ def test_exports_of_the_package_and_of_a_folder_that_cannot_be_written_are_in_th
     tmp_path, monkeypatch
 ):
     own = cache_folder() / "engines"
-    assert (
-        cached_export._folders("anytouch-tiny") == cached_export._folders("hf://user/repo") == [own]
-    )
+    assert cache._folders("anytouch-tiny") == cache._folders("hf://user/repo") == [own]
     path = weights(tmp_path / "w.safetensors")
     (tmp_path / ".engines").write_text("a file where the folder would be")
     one, two = (load_encoder(path).encode_touch(CLIPS[:, 0], "digit") for _ in range(2))
@@ -171,7 +169,7 @@ def test_xla_computes_what_an_export_cannot(tmp_path, monkeypatch):
     gpu = SimpleNamespace(default_backend=lambda: "gpu", tree=jax.tree, tree_util=jax.tree_util)
     for name, value in (("LARGEST", 10), ("jax", gpu)):
         with monkeypatch.context() as patch:
-            patch.setattr(cached_export, name, value)
+            patch.setattr(cache, name, value)
             assert load_encoder(path).exported(1) is None
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     assert load_encoder(path).exported(1) is None

@@ -9,10 +9,12 @@ from measuring import measuring_weights
 from tiny_models import touch_model
 
 from anytouch_jax.config import Config
-from anytouch_jax.encoder.encoder import EngineEncoder, load_encoder, random_encoder
+from anytouch_jax.encoder.encoder import load_encoder, random_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.export import engines
+from anytouch_jax.export.encoder import EngineEncoder
 from anytouch_jax.export.export import describes, export, load, read_checked
+from anytouch_jax.fields.measure import fields_of
 
 pytest.importorskip("onnxruntime")
 RNG = np.random.default_rng(0)
@@ -87,6 +89,48 @@ def test_an_exported_encoder_takes_the_place_of_the_live_one(exported, encoder):
     np.testing.assert_allclose(
         space["features"], encoder.encode_touch(CLIPS[:, :3], ROWS), atol=1e-5
     )
+
+
+def test_the_example_of_fields_gives_mm_and_newtons(tmp_path):
+    measuring = load_encoder(
+        measuring_weights(
+            tmp_path / "w.safetensors", {"depth": 1.5, "normal": 0.7, "modulus": {"digit": 80.0}}
+        )
+    )
+    export(measuring, tmp_path / "m.onnx", frames=3, form="onnx", fields=True)
+    about = json.loads(describes(tmp_path / "m.onnx").read_text())
+    of_sensor = about["fields"]["sensors"]
+    assert of_sensor["digit"] == {"width_mm": 14.25, "modulus_kpa": 80.0, "aspect": 0.2877}
+    assert "universal" not in of_sensor
+    first = next(iter(of_sensor))
+    space = {"frames": CLIPS[:, :3], "sensor": ROWS}
+    exec(about["example"].replace("m.onnx", str(tmp_path / "m.onnx")), space)
+    aspect = np.full(5, of_sensor[first]["aspect"], np.float32)
+    features, out = measuring.encode_and_measure(CLIPS[:, :3], ROWS, aspect)
+    scale = measuring.measure_of(first).scale
+    wanted = fields_of(out, scale, shape=scale.shape)
+    np.testing.assert_allclose(space["features"], features, atol=1e-5)
+    np.testing.assert_allclose(space["depth"], wanted.depth, atol=1e-4)
+    np.testing.assert_allclose(space["force"], wanted.force, atol=1e-3)
+    # every formula, in the words of the file
+    functions = {name: getattr(np, name) for name in ("sqrt", "exp", "tanh", "minimum")}
+    functions |= out._asdict() | of_sensor[first]
+    functions["deviation"] = lambda x: eval(about["fields"]["deviation(x)"], functions | {"x": x})
+    values = {
+        name: eval(one["formula"], functions) for name, one in about["fields"]["units"].items()
+    }
+    touched = wanted.area > 0
+    for name, value in values.items():
+        if name == "tangential_std":
+            ours = wanted.force_std[:, :1]
+        elif name == "normal_std":
+            ours = wanted.force_std[:, 2:]
+        elif name == "pressure":
+            ours = scale.modulus * out.pressure
+        else:
+            ours = getattr(wanted, name)
+        rows = touched if name.startswith("slip") else slice(None)
+        np.testing.assert_allclose(value[rows], ours[rows], rtol=1e-4, atol=1e-6, err_msg=name)
 
 
 def test_int8_is_calibrated_on_the_touches(exported, encoder, calibration):

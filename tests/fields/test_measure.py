@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from measuring import gel, measuring_weights
 
+import anytouch_jax as at
 from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.fields import measure as fields
@@ -100,6 +101,19 @@ def test_without_contact_and_without_a_width_nothing_is_invented():
         output(contact=np.full((1, SIDE, SIDE), -9.0)), fields.scale_of({}, "digit"), shape=4 / 3
     )
     assert free.area[0] == 0 and np.isnan(free.centre).all() and free.summary()["centre_x"] is None
+    # nothing slips where nothing touches
+    assert np.isnan(free.slip).all() and np.isnan(free.slip_std).all()
+    assert free.summary()["slip"] is None and free.summary()["slip_std"] is None
+    assert np.isnan(fields.stacked([free])["slip"]).all()
+    faulty = fields.fields_of(
+        output(contact=np.full((1, SIDE, SIDE), -9.0)),
+        fields.scale_of({}, "digit"),
+        shape=4 / 3,
+        faults=("grey",),
+    )
+    assert faulty.summary()["slip"] is None
+    touched = fields.fields_of(output(), fields.scale_of({}, "digit"), shape=4 / 3)
+    assert touched.slip[0] == 0.5 and touched.summary()["slip_std"] is not None
     unknown = fields.fields_of(output(), fields.scale_of({}, "mine"), shape=0.75)
     assert unknown.force is None and unknown.torque is None and unknown.summary()["force_z"] is None
     assert unknown.depth.max() == pytest.approx(0.05) and unknown.area[0] == pytest.approx(
@@ -192,6 +206,18 @@ def faulty(kind: str) -> tuple[np.ndarray, np.ndarray | None]:
     }[kind]
 
 
+def test_a_device_that_is_built_another_way_round_is_no_fault(encoder):
+    """The simulated DIGIT of an example has its lights the other way round than three real ones."""
+    for touch in at.example_touches():
+        lines: list[str] = []
+        seen = encoder.measure(touch.frame, touch.background, touch.sensor, log=lines.append)
+        assert not seen.faults and not lines, (touch.press, touch.sensor)
+    real, _ = faulty("none")
+    for turned in (real[:, ::-1], real[::-1], real[::-1, ::-1]):
+        both = np.ascontiguousarray(turned)
+        assert not fields.faults_of(both, both, "gelsight_mini", 0.75)
+
+
 @pytest.mark.parametrize(
     ("kind", "word"),
     [
@@ -254,11 +280,18 @@ def test_the_surface_is_a_mesh_in_mm(tmp_path):
     # 16 x 12 points
     assert b"element vertex 192" in head and b"element face 330" in head
     points = np.frombuffer(body[: 192 * 15], [("at", "<f4", 3), ("colour", "u1", 3)])
-    assert np.ptp(points["at"][:, 0]) == pytest.approx(14.25 * 11 / 12) and points["at"][0, 1] > 0
-    assert (
-        points["at"][:, 2].min() == pytest.approx(-0.05 * 14.25)
-        and len(body) == 192 * 15 + 330 * 13
-    )
+    at = points["at"].astype(float)
+    assert len(body) == 192 * 15 + 330 * 13
+    # x right, y down, z away from the camera: where the gel is pressed it is nearer
+    np.testing.assert_allclose(at, one.at(16, 12).points()[0].reshape(-1, 3), atol=1e-6)
+    assert np.ptp(at[:, 0]) == pytest.approx(14.25 * 11 / 12) and at[0, 0] < 0 and at[0, 1] < 0
+    assert at[:, 2].min() == pytest.approx(-0.05 * 14.25) and at[:, 2].max() == 0
+    assert at[at[:, 2] < -0.6][:, :2].max() < 0, "the upper left quarter is pressed"
+    assert b"comment frame: right-handed, x right, y down, z away from the camera" in head
+    # the front of every face is turned to the object
+    faces = np.frombuffer(body[192 * 15 :], [("count", "u1"), ("corners", "<i4", 3)])
+    corner, second, third = np.moveaxis(at[faces["corners"]], 1, 0)
+    assert (np.cross(second - corner, third - corner)[:, 2] > 0).all()
     picture = fields.overlay(gel(64, 48), one)
     assert (
         picture.shape == (64, 48, 3)

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from torch_files import legacy_bytes, tensor, zip_bytes
 
 from anytouch_jax.weights.safetensors import read_safetensors
 from tests.fuzz.harness import Case, cut, flipped, pick
-from tests.weights.conftest import legacy_bytes, tensor, zip_bytes
 
 SIZES = {
     "F32": 4,

@@ -161,6 +161,8 @@ def test_what_every_frame_publishes_until_ros_ends(
         if topic == "touch/points"
     ]
     assert len(wrenches) == len(clouds) == (2 if measures else 0)
+    # a press pushes the gel towards the camera, which is against z
+    assert all(one.force.z < 0 for one in wrenches)
     # N, N m and metres
     for force, points in zip(wrenches, clouds, strict=True):
         assert abs(force.force.z) > abs(force.torque.z) and np.ptp(points[..., 0]) == pytest.approx(

@@ -206,6 +206,8 @@ def test_pins_cover_the_declared_dependencies() -> None:
         *project["dependencies"],
         *(one for extra in project["optional-dependencies"].values() for one in extra),
     ]
+    # an extra may name others of this package, as [all] does
+    declared = [one for one in declared if not one.startswith("anytouch_jax[")]
     for requirement in map(Requirement, declared):
         assert "<" in str(requirement.specifier), f"{requirement} has no upper bound"
         assert pins[re.sub(r"[-_.]+", "-", requirement.name).lower()] in requirement.specifier

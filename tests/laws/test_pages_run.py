@@ -36,7 +36,7 @@ from anytouch_jax.live import stream as streams
 from anytouch_jax.live.stream import Mailbox
 from anytouch_jax.sim import dataset
 from anytouch_jax.sim.sensing.sensors import SENSORS, bases
-from tests.data.readers import test_bags, test_corpora, test_lerobot
+from tests.datasets.readers import test_bags, test_corpora, test_lerobot
 from tests.evaluate.test_probing import MAKERS, paint
 from tests.laws.test_readme import PAGES
 

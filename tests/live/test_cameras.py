@@ -1,8 +1,10 @@
 import fcntl
 import http.server
 import os
+import re
 import struct
 import threading
+import time
 
 import cv2
 import numpy as np
@@ -187,7 +189,8 @@ def test_an_address_is_a_camera_and_a_film_at_an_address_is_a_film(tmp_path):
                 "Content-Type", "video/avi" if is_film else "multipart/x-mixed-replace; boundary=b"
             )
             self.end_headers()
-            part = f"--b\r\nContent-Type: image/jpeg\r\nContent-Length: {len(picture)}\r\n\r\n".encode()
+            part = b"--b\r\nContent-Type: image/jpeg\r\n"
+            part += f"Content-Length: {len(picture)}\r\n\r\n".encode()
             self.wfile.write(film.read_bytes() if is_film else (part + picture + b"\r\n") * 200)
 
         def log_message(self, *_):
@@ -208,3 +211,38 @@ def test_an_address_is_a_camera_and_a_film_at_an_address_is_a_film(tmp_path):
         server.shutdown()
         server.server_close()
     refused("cannot be opened; check the address", open_source, f"{address}/gone.mjpg")
+
+
+class Slow:
+    """A camera that says it gives 200 frames/s, and repeats each of its pictures."""
+
+    def __init__(self, number: int) -> None:
+        self.is_there = number == 0
+        self.count = 0
+
+    def isOpened(self) -> bool:
+        return self.is_there
+
+    def grab(self) -> bool:
+        time.sleep(0.005)
+        self.count += 1
+        return True
+
+    def retrieve(self):
+        return True, np.full((8, 8, 3), self.count // 2, np.uint8)
+
+    def get(self, name: int) -> float:
+        return 200.0 if name == cv2.CAP_PROP_FPS else 1e3 * time.monotonic() - 30.0
+
+    def release(self) -> None:
+        pass
+
+
+def test_what_a_camera_gives_is_measured(system, monkeypatch):
+    monkeypatch.setattr(cv2, "VideoCapture", Slow)
+    lines = cameras.describe_cameras()
+    measured = next(line for line in lines if "gives" in line)
+    assert "fresh frames/s of 200" in measured and "30 ms old" in measured
+    assert 45 <= int(re.search(r"(\d+)% of frames repeat", measured)[1]) <= 55
+    assert any("and not 200 as it says" in line for line in lines)
+    assert "it cannot be opened now" in lines[-1]

@@ -1,8 +1,10 @@
 import os
 import signal
 import threading
+import time
 from itertools import pairwise
 
+import cv2
 import jax
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from films import write_film
 from anytouch_jax.data.images import frames_from_video
 from anytouch_jax.data.transforms import touch_evaluation
 from anytouch_jax.errors import UserError
+from anytouch_jax.live import reader
 from anytouch_jax.live import stream as streams
 
 DIGIT = 1
@@ -19,8 +22,8 @@ DIGIT = 1
 
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch):
-    monkeypatch.setattr(streams, "RETRY", 0.05)
-    monkeypatch.setattr(streams, "STUCK", 0.004)
+    monkeypatch.setattr(reader, "RETRY", 0.05)
+    monkeypatch.setattr(reader, "STUCK", 0.004)
 
 
 @pytest.fixture(scope="module")
@@ -109,8 +112,8 @@ def test_every_frame_of_a_video_in_order(encoder, video, frames, stride, clips):
     np.testing.assert_allclose([one.values for one in outcome], wanted, atol=1e-5)
     times = [one.at for one in outcome]
     assert times == sorted(times) and all(min(one.seconds) >= 0 for one in outcome)
-    # copy and encoder lie between frame and features
-    assert all(one.age >= sum(one.seconds[2:]) for one in outcome)
+    # the parts are all that lies between a frame and its features
+    np.testing.assert_allclose([sum(one.seconds) for one in outcome], [one.age for one in outcome])
     assert not source.isOpened()
 
 
@@ -185,13 +188,13 @@ def test_no_clip_spans_a_missed_read(encoder):
     mailbox = streams.Mailbox(replace=False)
     clips = []
     frames = [
-        streams.Frame(i, np.full((32, 40, 3), i, np.uint8), 0.0, 0.0, missed=int(i > 3))
+        reader.Frame(i, np.full((32, 40, 3), i, np.uint8), 0.0, 0.0, missed=int(i > 3))
         for i in range(8)
     ]
-    reader = threading.Thread(
-        target=streams._read, args=(iter(frames), lambda pixels: pixels, 3, 1, mailbox)
+    reading = threading.Thread(
+        target=reader.read_clips, args=(iter(frames), lambda pixels: pixels, 3, 1, mailbox)
     )
-    reader.start()
+    reading.start()
     while (clip := mailbox.take()) is not None:
         clips.append([int(frame.max()) for frame in clip.frames])
     assert clips == [[0, 1, 2], [1, 2, 3], [4, 5, 6], [5, 6, 7]]
@@ -295,10 +298,74 @@ def test_noise_is_reused_and_a_small_touch_is_not():
         streams.Reuse(-1.0)
 
 
+class RatedCamera:
+    """A camera that says it gives 250 frames/s: every second picture is new, or `every`th."""
+
+    def __init__(self, every: int, frames: int = 60) -> None:
+        self.every = every
+        self.left = frames
+        self.captured = 0.0
+
+    def grab(self) -> bool:
+        time.sleep(0.004)
+        self.captured = time.monotonic() - 0.05
+        self.left -= 1
+        return self.left >= 0
+
+    def retrieve(self):
+        return True, np.full((32, 40, 3), 90 + self.left // self.every, np.uint8)
+
+    def get(self, name: int) -> float:
+        return {cv2.CAP_PROP_FPS: 250.0, cv2.CAP_PROP_POS_MSEC: 1e3 * self.captured}[name]
+
+    def release(self) -> None:
+        pass
+
+
+@pytest.mark.parametrize("every", [1, 3])
+def test_fresh_frames_and_their_age_are_told(encoder, every, monkeypatch):
+    """Frames that repeat the one before are not fresh, and few fresh frames are warned about."""
+    monkeypatch.setattr(reader, "WINDOW", 0.1)
+    logged = []
+    # of a busy machine, even a good camera is late: it is judged by what it says
+    nominal = 250.0 if every > 1 else 1.0
+    monkeypatch.setattr(reader, "nominal_rate", lambda source: nominal)
+    camera = RatedCamera(every)
+    found = streams.collect(
+        streams.stream(encoder, camera, live=True, sensor=DIGIT, log=logged.append)
+    )
+    rate = found.rate(nominal)
+    assert rate.repeated == pytest.approx(1 - 1 / every, abs=0.05)
+    assert 0 < rate.fresh < 250 / every + 20 and 0.04 < rate.age < 1
+    assert "fresh frames/s of" in str(rate) and "old when it is read" in str(rate)
+    assert bool(rate.warning()) == (every > 1)
+    # once, while it streams
+    assert sum("fresh frames/s, and not 250" in line for line in logged) == (every > 1)
+
+
+def test_a_wait_for_the_encoder_has_a_name(encoder, monkeypatch):
+    """The parts sum up to the time from a frame to its features, on a camera that is faster."""
+    compile_for_one = streams.compile_for_one
+
+    def slow(*args, **options):
+        embed = compile_for_one(*args, **options)
+        return lambda clip: (time.sleep(0.03), embed(clip))[1]
+
+    monkeypatch.setattr(streams, "compile_for_one", slow)
+    found = streams.collect(
+        streams.stream(encoder, RatedCamera(1), live=True, sensor=DIGIT, log=lambda _: None)
+    )
+    np.testing.assert_allclose(found.seconds.sum(1), found.age, atol=1e-6)
+    wait = found.seconds[1:-1, streams.PARTS.index("wait")]
+    # a newer frame takes the place of one that waits
+    assert 0 < np.median(wait) < 0.03
+    assert any(line.startswith("wait ") for line in streams.budget(found))
+
+
 def some(count: int):
     for i in range(count):
         yield streams.Embedded(
-            i, 0.1 * i, np.full(3, i, np.float32), (0.001, 0.002, 0.003, 0.004), 0.02
+            i, 0.1 * i, np.full(3, i, np.float32), (0.001, 0.002, 0.0, 0.01, 0.003, 0.004), 0.02
         )
 
 

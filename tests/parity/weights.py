@@ -11,7 +11,7 @@ import numpy as np
 
 from anytouch_jax.config import Config, ModelConfig, Stack, preset
 from anytouch_jax.nn.functional import build
-from anytouch_jax.weights import convert, load
+from anytouch_jax.weights import convert, load, start
 from anytouch_jax.weights.keymaps import param_shapes
 from anytouch_jax.weights.tree import flatten, nest
 from tests.parity.golden_files import Arrays, Case, read_arrays
@@ -139,7 +139,7 @@ def _stage_map(
     fresh = nest(_values(param_shapes(model), 4))
     begun = "stage1" in name and not name.startswith("stage1")
     stage1 = convert.to_params(files["mae"], _two_layers()[0]) if begun else None
-    merged = load.first_params(fresh, model, stage1=stage1, clip=files["clip"])
+    merged = start.first_params(fresh, model, stage1=stage1, clip=files["clip"])
     ours = convert.to_release(merged, model)
     before = convert.to_release(fresh, model)
     used = release_names(model)

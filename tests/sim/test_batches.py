@@ -1,5 +1,6 @@
 import time
 from dataclasses import replace
+from functools import partial
 
 import cv2
 import jax
@@ -10,7 +11,7 @@ from batch_leaves import assert_same
 from anytouch_jax.config import Stack, preset
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.sim.batches import SIMULATED, SimulatedLoader, _partners, caption_tokenizer
-from anytouch_jax.sim.preparation import MOVED, moved_gel
+from anytouch_jax.sim.preparation import MOVED, field_batch, moved_gel
 from anytouch_jax.sim.real import load_real
 from anytouch_jax.training import pretrain
 
@@ -58,11 +59,11 @@ def recordings(tmp_path_factory):
             name = f"{unit}{number}.png"
             cv2.imwrite(str(folder / name), rng.integers(0, 255, (40, 40, 3), np.uint8))
             gel = "left.png" if unit == "left" else ""
-            place = number // 4
-            row = (
-                f"{name},gelsight_mini,{unit}{place},{number % 4},train,p{place},{unit},{gel},soft"
+            sequence = number // 4
+            lines.append(
+                f"{name},gelsight_mini,{unit}{sequence},{number % 4},train,p{sequence},{unit},"
+                f"{gel},soft"
             )
-            lines.append(row)
     (folder / "manifest.csv").write_text("\n".join(lines) + "\n")
     return folder / "manifest.csv"
 
@@ -159,3 +160,35 @@ def test_a_run_for_a_time_follows_the_time(tmp_path):
         and max(rates) > 0.5 * config.optim.learning_rate
         and rates[-1] < 0.5 * max(rates)
     )
+
+
+def test_the_pressure_in_a_picture_adds_up_to_the_force_in_newtons():
+    """Both go through width and proportions of the picture: 4:3 of a GelSight Mini, 3:4 of a DIGIT.
+
+    The label of the simulator comes from its own grid, which is square and has no zoom.
+    """
+    config = tiny()
+    loader = SimulatedLoader(config)
+    make = jax.jit(partial(field_batch, config=config, count=8))
+    shown, newtons, labels, tall = [], [], [], []
+    for step in range(20):
+        touches = jax.device_get(loader.touches(step))
+        rows = np.asarray(touches.sensor, np.int32)
+        batch = jax.device_get(make(jax.random.key(0), touches, rows))
+        width, aspect, modulus = (x[:, 0] for x in (touches.width, touches.aspect, touches.modulus))
+        kpa = np.asarray(touches.fields[:, 0, ..., 3], np.float64)
+        pixel = width**2 * np.exp(aspect) / kpa[0].size  # mm2
+        shown.append(1e-3 * kpa.sum((1, 2)) * pixel)
+        newtons.append(1e-3 * batch.force[:, 2] * modulus * width**2)
+        highest = kpa.max((1, 2))
+        at_border = np.maximum(kpa[:, [0, -1]].max((1, 2)), kpa[:, :, [0, -1]].max((1, 2)))
+        whole = (at_border < 0.02 * highest) & (highest > 0)
+        labels.append(np.where(whole, touches.labels["force"][:, 0, -1], np.nan))
+        tall.append(aspect > 0)
+    shown, newtons, labels, tall = map(np.concatenate, (shown, newtons, labels, tall))
+    np.testing.assert_allclose(newtons, shown, rtol=1e-4, atol=1e-5)
+    for group in (tall, ~tall):
+        inside = group & ~np.isnan(labels)
+        assert inside.sum() >= 8, "enough touches whose whole contact is in the picture"
+        ratio = np.median(shown[inside] / labels[inside])
+        assert ratio == pytest.approx(1, abs=0.07), "few pixels, so single sums are rough"

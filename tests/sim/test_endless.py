@@ -126,3 +126,12 @@ def test_kinds_that_are_held_out_never_occur():
     assert len({thing.seed for thing in more}) == len(more)
     with pytest.raises(UserError, match="no object of 5"):
         endless.objects_of(Scenes(objects=5), "test")
+
+
+def test_the_width_is_that_of_the_picture_which_shows_a_part_of_the_field(touches, drawn):
+    """A unit's camera may show less than the gel: `width` turns lengths of the picture into mm."""
+    zoom = drawn.clip.unit.zoom
+    across, down = drawn.numbers.field[..., 1], drawn.numbers.field[..., 0]
+    assert zoom.min() < 0.9, "some cameras show a part"
+    np.testing.assert_allclose(touches.width, across * zoom, rtol=1e-6)
+    np.testing.assert_allclose(np.exp(touches.aspect), down / across, rtol=1e-6)

@@ -140,6 +140,7 @@ def others(value):
     return [
         [*value, "another"],
         [*value, "image"],
+        [*value, ["a", 1.0]],
         [one / 2 + 0.01 for one in value if isinstance(one, float)],
     ]
 

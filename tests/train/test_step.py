@@ -68,9 +68,10 @@ def test_a_step_is_the_gradient_of_the_loss_through_adamw():
     change = jax.tree.map(
         lambda a, b: np.asarray(a) - np.asarray(b), new.trainable, state.trainable
     )
-    norm = lambda tree: np.sqrt(
-        sum(np.sum(np.square(x, dtype=np.float64)) for x in jax.tree.leaves(tree))
-    )
+
+    def norm(tree):
+        return np.sqrt(sum(np.sum(np.square(x, dtype=np.float64)) for x in jax.tree.leaves(tree)))
+
     assert metrics["grad_norm"] == pytest.approx(norm(grads), rel=1e-5)
     assert metrics["param_norm"] == pytest.approx(norm(state.trainable), rel=1e-6)
     assert metrics["update_norm"] == pytest.approx(norm(change), rel=1e-4)

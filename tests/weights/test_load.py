@@ -5,6 +5,7 @@ import jax
 import numpy as np
 import pytest
 from tiny_models import tiny_config
+from torch_files import tensor
 from weights_world import (
     STAGE1,
     STAGE2,
@@ -21,9 +22,9 @@ from anytouch_jax.config import SENSORS, UNIVERSAL, to_json
 from anytouch_jax.errors import UserError
 from anytouch_jax.nn.functional import build
 from anytouch_jax.weights.convert import resize_position, to_params, to_release
-from anytouch_jax.weights.load import first_params, load_init, load_model, read_weights
+from anytouch_jax.weights.load import load_model, read_weights
 from anytouch_jax.weights.safetensors import MODEL_KEY, export_safetensors, write_safetensors
-from tests.weights.conftest import tensor
+from anytouch_jax.weights.start import first_params, load_init
 
 TRAINED = ["digit", "gelsight_mini"]
 

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from places import ROOT
 from safetensors.numpy import load_file, save_file
-from tests.weights.test_families import MAE, made
 from tiny_models import touch_model
 
 from anytouch_jax import load_encoder
 from anytouch_jax.config import Config, Stack, preset
 from anytouch_jax.errors import UserError
 from anytouch_jax.nn.functional import build
-from anytouch_jax.zoo.families import load_start
+from anytouch_jax.weights.start import load_start
 from tests.support.weights_world import assert_same
+from tests.zoo.test_families import MAE, made
 
 OTHERS = ROOT / "tests" / "parity" / "golden_others"
 

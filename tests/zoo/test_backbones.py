@@ -21,7 +21,7 @@ from anytouch_jax import load_encoder
 from anytouch_jax.config import preset
 from anytouch_jax.errors import UserError
 from anytouch_jax.nn.functional import build
-from anytouch_jax.zoo.families import load_start
+from anytouch_jax.weights.start import load_start
 
 with np.load(Path(__file__).parent / "data" / "backbones.npz") as _file:
     ARRAYS = dict(_file)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from safetensors.numpy import save_file
+from torch_files import Call, Global, tensor, zip_bytes
 
 from anytouch_jax.config import UNIVERSAL, ModelConfig, Stack
 from anytouch_jax.errors import UserError
@@ -16,7 +17,6 @@ from anytouch_jax.weights.convert import file_shapes
 from anytouch_jax.weights.load import load_model
 from anytouch_jax.zoo.encoder import family_encoder, prepare
 from anytouch_jax.zoo.families import FAMILIES, entries_of, load_family
-from tests.weights.conftest import Call, Global, tensor, zip_bytes
 
 BY_TITLE = {family.title: family for family in FAMILIES}
 SPARSH = "Sparsh"

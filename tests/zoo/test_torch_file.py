@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from torch_files import Call, Global, Tensor, tensor
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.weights.load import read_weights
 from anytouch_jax.zoo.torch_file import read_torch
-from tests.weights.conftest import Call, Global, Tensor, tensor
 
 RNG = np.random.default_rng(0)
 

@@ -1,6 +1,4 @@
-"""The tactile camera: LeRobot's OpenCV camera, whose pictures are oriented and
-background-subtracted, or depth.
-"""
+"""The tactile camera: LeRobot's OpenCV camera, with oriented and subtracted pictures, or depth."""
 
 from __future__ import annotations
 
@@ -16,7 +14,7 @@ from anytouch_jax import Encoder, load_encoder
 from anytouch_jax.data.background.rule import RunningGel
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.transforms import orient_frame, subtract_background
-from anytouch_jax.fields.measure import Fields, Measure
+from anytouch_jax.encoder.measured import Fields, Measure
 from lerobot_camera_anytouch.config_anytouch import AnyTouchCameraConfig
 from lerobot_camera_anytouch.film import FilmCamera
 
@@ -27,8 +25,11 @@ class AnyTouchCamera(Camera):
     def __init__(self, config: AnyTouchCameraConfig) -> None:
         super().__init__(config)
         self.config = config
-        sides = (config.width, config.height)
-        width, height = reversed(sides) if config.rotate in (90, 270) else sides
+        width = config.width
+        height = config.height
+        if config.rotate in (90, 270):
+            # The configuration names the sides of the picture that one gets.
+            width, height = height, width
         self._camera: Any
         if Path(str(config.index_or_path)).is_file():
             self._camera = FilmCamera(Path(str(config.index_or_path)))
@@ -65,9 +66,9 @@ class AnyTouchCamera(Camera):
             self._gel.picture = decode(self.config.background)
             self._gel.settled = True
         self._gel.add(np.array(self._camera.read()))
-        self.__dict__.pop("_measure", None)  # it has the last gel
+        self.__dict__.pop("_measure", None)  # that of an earlier connection has its gel
         if self.config.depth:
-            # what cannot be measured fails here, and the encoder is ready for the first picture
+            # What cannot be measured fails here, and the encoder is ready for the first picture.
             self.fields()
 
     def disconnect(self) -> None:
@@ -102,24 +103,21 @@ class AnyTouchCamera(Camera):
         return self._oriented(self._camera.read_latest(max_age_ms=max_age_ms))
 
     def _ready(self, frame: np.ndarray) -> np.ndarray:
-        return self._encoder.preprocess(
-            frame, self._untouched() if self._encoder.subtracts else None
-        )
+        gel = self._untouched() if self._encoder.subtracts else None
+        return self._encoder.preprocess(frame, gel)
 
     def _measured(self, frame: np.ndarray) -> Fields:
         measure, row = self._measure
         aspect = np.full(1, np.log(frame.shape[0] / frame.shape[1]), np.float32)
-        return measure(
-            self._encoder.encode_and_measure(self._ready(frame)[None, None], row, aspect)[1],
-            [frame],
-        )
+        clip = self._ready(frame)[None, None]
+        return measure(self._encoder.encode_and_measure(clip, row, aspect)[1], [frame])
 
     @cached_property
     def _measure(self) -> tuple[Measure, np.ndarray]:
         encoder = self._encoder
         config = self.config
         measure = encoder.measure_of(config.sensor, self._untouched(), config.width_mm)
-        if measure.scale.width is None:
+        if measure.width_mm is None:
             raise ValueError(
                 f"nobody knows the mm that a picture of {config.sensor} shows: name width_mm"
             )

@@ -1,5 +1,6 @@
-"""A film in the place of LeRobot's OpenCV camera, which reads a film as fast as it can and ends
-with it.
+"""A film in the place of LeRobot's OpenCV camera.
+
+LeRobot's own reads a film as fast as it can, and ends with it.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from anytouch_jax.live.page.live import LoopedFilm
+from anytouch_jax.live.cameras import LoopedFilm
 
 
 class FilmCamera:

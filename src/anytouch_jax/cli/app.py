@@ -1,12 +1,14 @@
 """The `anytouch` command: its subcommands, its help and its exit statuses.
 
 0 is success, 1 a failed check, 2 a user's mistake, 130 Ctrl-C and 141 a closed pipe.
+
+A subcommand is a row of COMMANDS, and its module is imported when it is used: so `anytouch --help`
+needs no package beside Python's own, and a command of a ring costs nothing to the others.
 """
 
 from __future__ import annotations
 
 import errno
-import inspect
 import os
 import sys
 import warnings
@@ -16,33 +18,50 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from anytouch_jax import __version__
-from anytouch_jax.cli import (
-    data,
-    embed,
-    export,
-    info,
-    measure,
-    probe,
-    retrieve,
-    sensor,
-    stream,
-    train,
-)
 from anytouch_jax.cli.arguments import RENAMED, parse_options
+from anytouch_jax.doors import Door, enter, lacking
 from anytouch_jax.errors import CheckError, UserError, shorten
 
 
 class Command(NamedTuple):
-    """A subcommand: the record of its options, what it runs, and how its arguments are parsed."""
+    """A subcommand, as names that are imported when they are used.
 
-    options: type
-    run: Callable[[Any], int]
-    parse: Callable[..., Any] = parse_options
+    Attributes:
+        record: "module:class" of its options, below `anytouch_jax.cli`.
+        function: "module:function" that it runs, from that record to an exit status.
+        summary: one line for the help, which imports no command.
+        parser: "module:function" that reads its words, if that is not `parse_options`.
+        extra: of `pip install "anytouch_jax[extra]"`, if it needs more than the core.
+    """
+
+    record: str
+    function: str
+    summary: str
+    parser: str = ""
+    extra: str = ""
 
     @property
-    def summary(self) -> str:
-        """The first line of its help."""
-        return (inspect.getdoc(self.options) or "").splitlines()[0]
+    def options(self) -> type:
+        """The class of its options."""
+        kind: type = self._find(self.record)
+        return kind
+
+    @property
+    def run(self) -> Callable[[Any], int]:
+        """What it runs."""
+        run: Callable[[Any], int] = self._find(self.function)
+        return run
+
+    @property
+    def parse(self) -> Callable[..., Any]:
+        """What reads its words."""
+        if not self.parser:
+            return parse_options
+        parse: Callable[..., Any] = self._find(self.parser)
+        return parse
+
+    def _find(self, target: str) -> Any:
+        return enter(Door(f"cli.{target}", self.extra))
 
 
 GROUPS = {
@@ -51,26 +70,109 @@ GROUPS = {
     "probe": "Probe frozen features with simple heads.",
 }
 COMMANDS = {
-    "data simulate": Command(data.SimulateOptions, data.run_simulate),
-    "data index": Command(data.DatasetOptions, data.run_index),
-    "data contact": Command(data.ContactOptions, data.run_contact),
-    "data verify": Command(data.VerifyOptions, data.run_verify),
-    "data annotate": Command(data.AnnotateOptions, data.run_annotate),
-    "data pack": Command(data.PackOptions, data.run_pack),
-    "train": Command(train.TrainOptions, train.run, train.parse),
-    "embed": Command(embed.EmbedOptions, embed.run),
-    "measure": Command(measure.MeasureOptions, measure.run),
-    "stream": Command(stream.StreamOptions, stream.run_stream),
-    "probe label": Command(probe.LabelOptions, probe.run_label),
-    "probe tasks": Command(probe.TasksOptions, probe.run_tasks),
-    "probe benchmark": Command(probe.BenchmarkOptions, probe.run_benchmark),
-    "retrieve": Command(retrieve.RetrieveOptions, retrieve.run_retrieve),
-    "sensor fit": Command(sensor.FitOptions, sensor.run_fit),
-    "report": Command(retrieve.ReportOptions, retrieve.run_report),
-    "adapt": Command(sensor.AdaptOptions, sensor.run_adapt),
-    "export": Command(export.ExportOptions, export.run),
-    "info": Command(info.InfoOptions, info.run),
-    "view": Command(stream.ViewOptions, stream.run_view),
+    "data simulate": Command(
+        "data:SimulateOptions",
+        "data:run_simulate",
+        "Simulate touches felt by several sensors, with photographs, captions and forces.",
+    ),
+    "data index": Command(
+        "data:DatasetOptions",
+        "data:run_index",
+        "Make a manifest of a downloaded dataset or of your recordings.",
+    ),
+    "data contact": Command(
+        "data:ContactOptions",
+        "data:run_contact",
+        "Mark the frames in contact by their difference from the background.",
+    ),
+    "data verify": Command(
+        "data:VerifyOptions",
+        "data:run_verify",
+        "Check manifests and their files: missing, broken, repeated, swapped or leaking.",
+    ),
+    "data annotate": Command(
+        "data:AnnotateOptions",
+        "data:run_annotate",
+        "Caption every touch without a text by a vision-language model.",
+        extra="annotate",
+    ),
+    "data pack": Command(
+        "data:PackOptions",
+        "data:run_pack",
+        "Store millions of small files in a few ZIP shards, which training reads as well.",
+    ),
+    "train": Command(
+        "train:TrainOptions",
+        "train:run",
+        "Pre-train stage 1 (masked autoencoding) or stage 2 (alignment, matching).",
+        parser="train:parse",
+    ),
+    "embed": Command(
+        "embed:EmbedOptions",
+        "embed:run",
+        "Embed a manifest, a folder of frames, a picture or a video: an .npz of features.",
+    ),
+    "measure": Command(
+        "measure:MeasureOptions",
+        "measure:run",
+        "Measure depth, shear, contact area and force in mm and N.",
+    ),
+    "stream": Command(
+        "stream:StreamOptions",
+        "stream:run_stream",
+        "Embed a camera or a video frame by frame, and report the latency.",
+    ),
+    "probe label": Command(
+        "probe:LabelOptions",
+        "probe:run_label",
+        "Probe a label column with linear and kNN heads on frozen features.",
+    ),
+    "probe tasks": Command(
+        "probe:TasksOptions",
+        "probe:run_tasks",
+        "Probe named tasks, with new splits of whole objects and recordings by every seed.",
+    ),
+    "probe benchmark": Command(
+        "probe:BenchmarkOptions",
+        "probe:run_benchmark",
+        "Probe a public benchmark with the authors' settings.",
+    ),
+    "retrieve": Command(
+        "retrieve:RetrieveOptions",
+        "retrieve:run_retrieve",
+        "Retrieve the same touch felt by another sensor, or search stored touches.",
+    ),
+    "sensor fit": Command(
+        "sensor:FitOptions",
+        "sensor:run_fit",
+        "Fit the look of your sensor to 5 to 50 pictures of it, for the simulator.",
+    ),
+    "report": Command(
+        "retrieve:ReportOptions",
+        "retrieve:run_report",
+        "Report on a stage-1 and a stage-2 run: samples, losses, retrieval, probes.",
+    ),
+    "adapt": Command(
+        "sensor:AdaptOptions",
+        "sensor:run_adapt",
+        "Make tokens for a new sensor from simulated touches, or from a few labelled frames.",
+    ),
+    "export": Command(
+        "export:ExportOptions",
+        "export:run",
+        "Export a touch encoder for jax alone or as ONNX, or weights as safetensors.",
+    ),
+    "info": Command(
+        "info:InfoOptions",
+        "info:run",
+        "Describe an encoder, a run, weights, a manifest, features, a head or cameras.",
+    ),
+    "view": Command(
+        "stream:ViewOptions",
+        "stream:run_view",
+        "Show recordings, features, a run or a camera on a page in the browser.",
+        extra="view",
+    ),
 }
 
 
@@ -105,10 +207,22 @@ def _main(argv: Sequence[str] | None) -> int:
     if name not in COMMANDS:
         print(_unknown(name, group), file=sys.stderr)
         return 2
-    command = COMMANDS[name]
-    return guarded(
-        f"anytouch {name}", lambda: command.run(command.parse(command.options, name, words[1:]))
-    )
+    return guarded(f"anytouch {name}", lambda: _run(COMMANDS[name], name, words[1:]))
+
+
+def _run(command: Command, name: str, words: Sequence[str]) -> int:
+    """Read the words of a command and run it.
+
+    Raises UserError that names the extra of a package that is not installed.
+    """
+    try:
+        return command.run(command.parse(command.options, name, words))
+    except ModuleNotFoundError as error:
+        missing = error.name or ""
+        # One of ours is a bug, and so is one that no extra brings.
+        if not command.extra or missing.startswith("anytouch_jax"):
+            raise
+        raise lacking(f"anytouch {name}", missing, command.extra) from None
 
 
 def guarded(program: str, run: Callable[[], int]) -> int:
@@ -123,7 +237,8 @@ def guarded(program: str, run: Callable[[], int]) -> int:
             try:
                 status = run()
             except Exception as error:
-                if missing := _missing_devices():
+                missing = _missing_devices()
+                if missing is not None:
                     raise missing from error
                 raise
         sys.stdout.flush()
@@ -142,9 +257,8 @@ def guarded(program: str, run: Callable[[], int]) -> int:
         advice = ". Free some space." if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
         sentence = f"{error.filename or 'a file'}: {error.strerror or error}{advice}"
     except (MemoryError, RuntimeError) as error:
-        if not isinstance(error, MemoryError) and "RESOURCE_EXHAUSTED" not in str(
-            error
-        ):  # XLA's is a RuntimeError
+        # XLA's is a RuntimeError, and so are bugs
+        if isinstance(error, RuntimeError) and "RESOURCE_EXHAUSTED" not in str(error):
             raise
         less = "Use a smaller --batch, --size, --gallery or --preset, or --model.remat in training."
         sentence = f"there is not enough memory. {less}"
@@ -156,8 +270,9 @@ def guarded(program: str, run: Callable[[], int]) -> int:
 
 
 def _missing_devices() -> UserError | None:
-    """Return the error of a JAX_PLATFORMS that jax cannot use, which it raises as one of many
-    types; None otherwise.
+    """Return the error of a JAX_PLATFORMS that jax cannot use, None otherwise.
+
+    jax raises it as one of many types, wherever its devices are needed first.
     """
     platforms = os.environ.get("JAX_PLATFORMS", "")
     jax = sys.modules.get("jax")
@@ -176,8 +291,9 @@ def _missing_devices() -> UserError | None:
 def _show_warning(
     default: Callable[..., None], message: Warning | str, category: type[Warning], *where: Any
 ) -> None:
-    """Print a UserWarning of the library as a sentence, without the line of code that Python
-    shows.
+    """Print a UserWarning of the library as a sentence.
+
+    Python would show a line of code with it, which says nothing to a user.
     """
     if category is UserWarning:
         print(shorten(str(message)), file=sys.stderr)
@@ -187,16 +303,18 @@ def _show_warning(
 
 def _usage(group: str = "") -> str:
     """Return the help that lists the commands of a group, or all of them."""
-    shown = {
-        name: command
-        for name, command in COMMANDS.items()
-        if not group or name.startswith(f"{group} ")
-    }
+    shown = COMMANDS
+    prefix = ""
+    about = "One representation of touch for many camera-based tactile sensors."
+    example = "embed"
+    if group:
+        prefix = f"{group} "
+        shown = {name: one for name, one in COMMANDS.items() if name.startswith(prefix)}
+        about = GROUPS[group]
+        example = next(iter(shown))
     width = max(map(len, shown))
     lines = "\n".join(f"  {name:{width}}  {command.summary}" for name, command in shown.items())
-    about = GROUPS.get(group, "One representation of touch for many camera-based tactile sensors.")
-    example = next(iter(shown)) if group else "embed"
-    return f"""usage: anytouch {group + " " if group else ""}COMMAND [options]
+    return f"""usage: anytouch {prefix}COMMAND [options]
 
 {about}
 

@@ -1,29 +1,40 @@
-"""Command-line arguments: from argv to one frozen record of options, and one sentence for a mistake
-in them.
+"""Command-line arguments: from argv to one frozen record of options.
+
+A mistake is answered by one sentence that says what is right. tyro draws the help from the same
+records, but it does not parse: its errors are boxes of text behind SystemExit(2), from which no
+sentence of ours could be made. So words are read once, here.
 """
 
 from __future__ import annotations
 
-import contextlib
-import io
+import math
 import os
 import re
-import sys
 import types
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import MISSING, fields, is_dataclass
+from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    NamedTuple,
+    NoReturn,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 from anytouch_jax.config.parsing import check
 from anytouch_jax.errors import UserError
 
-# the encoder of commands without --model; `weights.registry` has its files
+# The encoder of commands without --model; `weights.registry` has its files.
 DEFAULT = "anytouch-tiny"
 
-# Old names of commands, and of options: each applies to a command without an option of the old
-# name.
+# Old names of commands and options. One of an option applies to commands that have no option of
+# the old name.
 RENAMED = {
     **{
         name: f"anytouch data {name}"
@@ -59,52 +70,83 @@ def parse_options(
     add_help: bool = True,
     others: Mapping[str, str] | None = None,
 ) -> Any:
-    """Return the record `kind` of the options in `args`.
+    """Return the record of the options in `args`.
 
-    `others` are options of the command that are parsed elsewhere. Raises UserError for words that
-    are no options, for values of another type or out of their range, and SystemExit after --help.
+    Args:
+        kind: the class of the record, a dataclass.
+        name: of the command, such as "probe label".
+        args: the words after it.
+        default: a record that has the values of options that are not given, and the sections.
+        add_help: whether --help prints the page of the command.
+        others: options of the command that are parsed elsewhere, {as typed: right name}.
+
+    Raises:
+        UserError: for words that are no options, and for values of another type or out of their
+            range. Nothing else has been done by then.
+        SystemExit: after --help.
     """
-    import tyro
-
     args = [expand_home(arg) for arg in args]
     _refuse_renamed(kind, args)
-    if not (add_help and {"-h", "--help"} & {*args}):
-        check_words(name.partition(" [")[0], [*options_of(kind, default)], args, others or {})
+    if add_help and {"-h", "--help"} & {*args}:
+        print_help(kind, name, default)
+    options = [*options_of(kind, default)]
+    advice = f"see anytouch {name.partition(' [')[0]} --help"
+    given = read_words(options, args, advice, others or {})
+    values: dict[tuple[str, ...], Any] = {}
+    for one in given:
+        check_values(one, advice)
+        values[one.option.path] = one.value()
+    check_complete(options, given, advice)
+    record = make_record(kind, default, values)
+    check(record, "--")
+    return record
+
+
+def print_help(kind: Any, name: str, default: Any = None) -> NoReturn:
+    """Print the help of a command and exit."""
+    import tyro
+
     # The text of an option explains a default that is None or empty.
     hint = tyro.conf.arg(
         help_behavior_hint=lambda value: "" if value in ("None", "") else f"(default: {value})"
     )
-    kept = get_type_hints(kind, include_extras=True)
-    marks = {
-        field.name: (hint, *[tyro.conf.DisallowNone] * (field.default is None))
-        for field in fields(kind)
-    }
-    hints = {name: Annotated[kept[name], *more] for name, more in marks.items()}
+    hints = {}
+    for name_of, annotation in get_type_hints(kind, include_extras=True).items():
+        hints[name_of] = Annotated[annotation, hint]
+    for one in fields(kind):
+        # Without, tyro offers None as a value of every option that may be left out.
+        if one.default is None:
+            hints[one.name] = Annotated[hints[one.name], tyro.conf.DisallowNone]
     about = {"__doc__": kind.__doc__, "__module__": kind.__module__, "__annotations__": hints}
     shown = type(kind.__name__, (kind,), about)
-    extra = {} if default is None else {"default": default}
-    printed = io.StringIO()
-    try:
-        with contextlib.redirect_stderr(printed):
-            options = tyro.cli(
-                shown,
-                prog=f"anytouch {name}",
-                args=args,
-                config=[tyro.conf.AvoidSubcommands],
-                add_help=add_help,
-                **extra,
-            )
-    except SystemExit as stop:
-        error: BaseException | None = stop
-        # a record that refuses its values: tyro draws a box around the error
-        while error is not None:
-            if isinstance(error, UserError):
-                raise error from None
-            error = error.__context__
-        sys.stderr.write(printed.getvalue())
-        raise
-    check(options, "--")
-    return options
+    extra = {}
+    if default is not None:
+        extra["default"] = default
+    tyro.cli(
+        shown,
+        prog=f"anytouch {name}",
+        args=["--help"],
+        config=[tyro.conf.AvoidSubcommands],
+        **extra,
+    )
+    raise SystemExit(0)
+
+
+def make_record(
+    kind: Any, default: Any, values: Mapping[tuple[str, ...], Any], path: tuple[str, ...] = ()
+) -> Any:
+    """Return a record with `values` by the path of their field, and others as in `default`."""
+    changes = {}
+    for one in fields(kind):
+        own = (*path, one.name)
+        if own in values:
+            changes[one.name] = values[own]
+        elif any(key[: len(own)] == own for key in values):
+            section = getattr(default, one.name)
+            changes[one.name] = make_record(type(section), section, values, own)
+    if default is None:
+        return kind(**changes)
+    return replace(default, **changes)
 
 
 def expand_home(arg: str) -> str:
@@ -121,20 +163,35 @@ def spelled(field: str) -> str:
 
 
 def _refuse_renamed(kind: Any, args: Sequence[str]) -> None:
+    """Raise UserError for the old name of an option or of its section."""
     known = set(map(spelled, get_type_hints(kind)))
     for option in map(option_of, args):
-        for old in (option, option.partition(".")[0]):
-            if old.startswith("--") and old in RENAMED and old not in known:
-                rest = option.removeprefix(old) if RENAMED[old].startswith("--") else ""
-                raise UserError(f"{option} has a new name: use {RENAMED[old]}{rest}")
+        section, _, _ = option.partition(".")
+        for old in (option, section):
+            if not old.startswith("--") or old not in RENAMED or old in known:
+                continue
+            right = RENAMED[old]
+            if right.startswith("--"):
+                right += option.removeprefix(old)
+            raise UserError(f"{option} has a new name: use {right}")
 
 
 class Option(NamedTuple):
-    """An option `--name`, or a positional NAME, with values of the types `kinds`, again and again
-    if it is a list.
+    """An option `--name`, or a positional NAME.
+
+    Attributes:
+        name: as it is typed.
+        path: names of the fields that lead to its value, that of its section first.
+        kinds: the types of its values, one for each.
+        is_list: it takes values of these types again and again.
+        is_positional: it has no name on the command line.
+        is_required: it has no default.
+        may_be_none: "None" is a value.
+        may_be_empty: a list without values is a value.
     """
 
     name: str
+    path: tuple[str, ...]
     kinds: tuple[Any, ...]
     is_list: bool
     is_positional: bool
@@ -153,162 +210,243 @@ class Option(NamedTuple):
         return self.is_list or len(self.kinds) > 1
 
 
+@dataclass
+class Given:
+    """An option with its name and values as they were typed."""
+
+    option: Option
+    name: str
+    values: list[str] = field(default_factory=list)
+
+    @property
+    def is_none(self) -> bool:
+        """Whether the word None stands for no value."""
+        return self.option.may_be_none and self.values == ["None"]
+
+    def room(self) -> float:
+        """Return how many more words belong to it."""
+        if self.option.is_flag:
+            return 0
+        if self.option.is_list:
+            return math.inf
+        return len(self.option.kinds) - len(self.values)
+
+    def value(self) -> Any:
+        """Return the value of the field. The words must have been checked."""
+        if self.option.is_flag:
+            return self.name == self.option.name  # --no-x is another name of the flag --x
+        if self.is_none:
+            return None
+        kinds = self.option.kinds
+        count = len(kinds)
+        values = [_convert(kinds[place % count], word) for place, word in enumerate(self.values)]
+        if not self.option.is_list:
+            return tuple(values) if count > 1 else values[0]
+        if count == 1:
+            return tuple(values)
+        return tuple(tuple(values[i : i + count]) for i in range(0, len(values), count))
+
+
+def _convert(kind: Any, word: str) -> Any:
+    """Return a word as a value of a type or of a Literal."""
+    if get_origin(kind) is Literal:
+        return next(one for one in get_args(kind) if str(one) == word)
+    return kind(word)
+
+
 def option_of(arg: str) -> str:
     """Return the name of an option as documented: --save-every for --save_every=5."""
     return arg.partition("=")[0].replace("_", "-")
 
 
-def options_of(kind: Any, default: Any = None, prefix: str = "") -> Iterator[Option]:
-    """Yield the options of a record, of a section as section.name; a part that `default` lacks has
-    none.
-    """
-    from tyro.conf import Positional
+def options_of(kind: Any, default: Any = None, path: tuple[str, ...] = ()) -> Iterator[Option]:
+    """Yield the options of a record; those of a section are called section.name.
 
+    A section that `default` lacks has none.
+    """
     hints = get_type_hints(kind, include_extras=True)
-    for field in fields(kind):
-        hint = hints[field.name]
+    for one in fields(kind):
+        hint = hints[one.name]
         marks = tuple[Any, ...]()
         if get_origin(hint) is Annotated:
             hint, *rest = get_args(hint)
             marks = tuple(rest)
-        choices = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
-        (inner,) = [one for one in choices if one is not type(None)]
-        value = getattr(default, field.name, None)
+        choices = (hint,)
+        if get_origin(hint) in (Union, types.UnionType):
+            choices = get_args(hint)
+        (inner,) = [choice for choice in choices if choice is not type(None)]
+        own_path = (*path, one.name)
         if is_dataclass(inner):
-            if default is None or value is not None:
-                yield from options_of(inner, value, f"{prefix}{field.name.replace('_', '-')}.")
+            section = getattr(default, one.name, None)
+            if default is None or section is not None:
+                yield from options_of(inner, section, own_path)
             continue
-        is_list = get_origin(inner) is tuple and get_args(inner)[-1] is Ellipsis
-        inner = get_args(inner)[0] if is_list else inner
-        kinds = get_args(inner) if get_origin(inner) is tuple else (inner,)
-        is_required = default is None and field.default is field.default_factory is MISSING
-        is_positional = Positional in marks
-        name = field.name.upper() if is_positional else f"--{prefix}{field.name.replace('_', '-')}"
-        may_be_none = type(None) in choices and bool(prefix or field.default is not None)
-        yield Option(name, kinds, is_list, is_positional, is_required, may_be_none, bool(prefix))
+        yield _option(one, own_path, inner, marks, default)._replace(
+            may_be_none=type(None) in choices and bool(path or one.default is not None)
+        )
 
 
-def check_words(
-    command: str,
-    options: Sequence[Option],
-    args: Sequence[str],
-    others: Mapping[str, str] = types.MappingProxyType({}),
-) -> None:
-    """Raise UserError for words `args` that are no options (`others` are elsewhere), and for values
-    that are unfit.
+def _option(
+    one: Field[Any], path: tuple[str, ...], inner: Any, marks: tuple[Any, ...], default: Any
+) -> Option:
+    """Return the option of a field whose values have the type `inner`."""
+    from tyro.conf import Positional
+
+    args = get_args(inner)
+    is_list = get_origin(inner) is tuple and args[-1] is Ellipsis
+    if is_list:
+        inner = args[0]
+    kinds = (inner,)
+    if get_origin(inner) is tuple:
+        kinds = get_args(inner)
+    is_positional = Positional in marks
+    name = "--" + ".".join(path).replace("_", "-")
+    if is_positional:
+        name = one.name.upper()
+    has_default = one.default is not MISSING or one.default_factory is not MISSING
+    in_section = len(path) > 1
+    return Option(
+        name=name,
+        path=path,
+        kinds=kinds,
+        is_list=is_list,
+        is_positional=is_positional,
+        is_required=default is None and not has_default,
+        may_be_none=False,
+        may_be_empty=in_section and is_list,
+    )
+
+
+def read_words(
+    options: Sequence[Option], args: Sequence[str], advice: str, others: Mapping[str, str]
+) -> list[Given]:
+    """Return the options that are given, with their words.
+
+    Words after an option belong to it as far as it takes more, then to the positional ones.
+
+    Args:
+        options: of the command.
+        args: the words.
+        advice: ends a sentence for which nothing better is known.
+        others: options that are parsed elsewhere, {as typed: right name}, for guesses.
+
+    Raises:
+        UserError: for a word that is no option and belongs to none.
     """
-    advice = f"see anytouch {command} --help"
     named = {option.name: option for option in options if not option.is_positional}
     for option in options:
         if option.is_flag:
             *section, last = option.name.removeprefix("--").split(".")
             named["--" + ".".join([*section, f"no-{last}"])] = option
     positional = [option for option in options if option.is_positional]
-    given: list[tuple[Option, str, list[str]]] = []
-    room = 0
+    given = list[Given]()
     only_values = False
     for arg in args:
         if arg == "--" and not only_values:
             only_values = True
         elif is_option(arg) and not only_values:
             name = option_of(arg)
-            equals = "=" in arg
-            value = arg.partition("=")[2]
             if name not in named:
-                raise UserError(_unknown(name, {**others, **{one: one for one in named}}, advice))
-            option = named[name]
-            values = [value] if equals else []
-            if option.is_flag and equals:
-                raise UserError(f"{name} takes no value: {advice}")
-            given.append((option, name, values))
-            room = (
-                0 if option.is_flag else -1 if option.is_list else len(option.kinds) - len(values)
-            )
-        elif room:
-            given[-1][2].append(arg)
-            room -= 1
+                known = {**others, **{one: one for one in named}}
+                raise UserError(_unknown(name, known, advice))
+            given.append(Given(named[name], name))
+            _, has_value, value = arg.partition("=")
+            if has_value:
+                if named[name].is_flag:
+                    raise UserError(f"{name} takes no value: {advice}")
+                given[-1].values.append(value)
+        elif given and given[-1].room() > 0:
+            given[-1].values.append(arg)
         elif positional:
             option = positional.pop(0)
-            given.append((option, option.name, [arg]))
-            room = -1 if option.is_list else len(option.kinds) - 1
+            given.append(Given(option, option.name, [arg]))
         else:
-            missing = next(
-                (
-                    one.name
-                    for one in options
-                    if one.is_required and one not in [g[0] for g in given]
-                ),
-                "",
-            )
-            guess = f"did you mean {missing} {arg}?" if missing else advice
-            raise UserError(f"{arg!r} belongs to no option: {guess}")
-    for option, name, values in given:
-        _check_values(option, name, values, advice)
-    present = [option for option, _, _ in given]
-    if missing_names := [
-        option.name for option in options if option.is_required and option not in present
-    ]:
-        listed = (
-            f"{', '.join(missing_names[:-1])} and {missing_names[-1]}"
-            if missing_names[1:]
-            else missing_names[0]
-        )
-        raise UserError(f"{listed} {'are' if missing_names[1:] else 'is'} missing: {advice}")
-    for option, name, _ in given:
-        if option.takes_several and [one[0] for one in given].count(option) > 1:
-            raise UserError(f"{name} is given twice. Write it once, followed by all its values.")
+            raise UserError(_of_no_option(arg, options, given, advice))
+    return given
+
+
+def _of_no_option(arg: str, options: Sequence[Option], given: Sequence[Given], advice: str) -> str:
+    """Return the sentence for a word that belongs to no option.
+
+    An option that is required and missing is what most probably was left out before it.
+    """
+    present = [one.option for one in given]
+    for option in options:
+        if option.is_required and option not in present:
+            return f"{arg!r} belongs to no option: did you mean {option.name} {arg}?"
+    return f"{arg!r} belongs to no option: {advice}"
 
 
 def is_option(arg: str) -> bool:
     """Return whether a word is an option, and not a number such as -1."""
-    return (
-        arg.startswith("-")
-        and arg.lstrip("-")[:1].isalpha()
-        and arg.lstrip("-").lower() not in ("inf", "nan")
-    )
+    word = arg.lstrip("-")
+    return arg.startswith("-") and word[:1].isalpha() and word.lower() not in ("inf", "nan")
 
 
 def _unknown(name: str, known: Mapping[str, str], advice: str) -> str:
     near = get_close_matches(name, known, 1)
-    return f"there is no option {name[:60]}: " + (
-        f"did you mean {known[near[0]]}?" if near else advice
-    )
+    hint = f"did you mean {known[near[0]]}?" if near else advice
+    return f"there is no option {name[:60]}: {hint}"
 
 
-def _check_values(option: Option, name: str, values: Sequence[str], advice: str) -> None:
-    """Raise UserError for a number of values or a value that the option does not take."""
-    if (
-        option.is_flag
-        or (option.may_be_none and list(values) == ["None"])
-        or (option.may_be_empty and not values)
-    ):
+def check_complete(options: Sequence[Option], given: Sequence[Given], advice: str) -> None:
+    """Raise UserError for a required option that is missing, and for a list that is given twice.
+
+    A list that is given twice would have the second values alone, without a word.
+    """
+    present = [one.option for one in given]
+    missing = [one.name for one in options if one.is_required and one not in present]
+    if len(missing) == 1:
+        raise UserError(f"{missing[0]} is missing: {advice}")
+    if missing:
+        raise UserError(f"{', '.join(missing[:-1])} and {missing[-1]} are missing: {advice}")
+    for one in given:
+        if one.option.takes_several and present.count(one.option) > 1:
+            raise UserError(
+                f"{one.name} is given twice. Write it once, followed by all its values."
+            )
+
+
+def check_values(given: Given, advice: str) -> None:
+    """Raise UserError for a number of values or a value that an option does not take."""
+    option = given.option
+    name = given.name
+    values = given.values
+    if option.is_flag or given.is_none or (option.may_be_empty and not values):
         return
-    if option.takes_several and (right := _without_commas(option, values)):
-        shown = " ".join(right) if option.is_positional else f"{name} {' '.join(right)}"
-        raise UserError(f"{name} takes values separated by blanks: write {shown}")
+    if option.takes_several:
+        right = " ".join(_without_commas(option, values))
+        if right:
+            shown = right if option.is_positional else f"{name} {right}"
+            raise UserError(f"{name} takes values separated by blanks: write {shown}")
     count = len(option.kinds)
     if not values:
         what = f"{count} values" if count > 1 else _TAKES.get(option.kinds[0], "a value")
         raise UserError(f"{name} needs {what}: {advice}")
-    if len(values) % count or (not option.is_list and len(values) != count):
-        groups = f"groups of {count} values" if option.is_list else f"{count} values"
-        raise UserError(f"{name} takes {groups}, not {len(values)}: {advice}")
-    for number, value in enumerate(values):
-        kind = option.kinds[number % count]
-        if get_origin(kind) is Literal:
-            choices = [str(one) for one in get_args(kind)]
-            if value not in choices:
-                near = get_close_matches(value, choices, 1)
-                hint = f": did you mean {near[0]}?" if near else ""
-                raise UserError(
-                    f"{name} takes {', '.join(choices[:-1])} or {choices[-1]}, not "
-                    f"{value[:60]!r}{hint}"
-                )
-        elif kind in _TAKES:
-            try:
-                kind(value)
-            except ValueError:
-                raise UserError(f"{name} takes {_TAKES[kind]}, not {value[:60]!r}") from None
+    if option.is_list and len(values) % count:
+        raise UserError(f"{name} takes groups of {count} values, not {len(values)}: {advice}")
+    if not option.is_list and len(values) != count:
+        raise UserError(f"{name} takes {count} values, not {len(values)}: {advice}")
+    for place, value in enumerate(values):
+        _check_value(name, option.kinds[place % count], value)
+
+
+def _check_value(name: str, kind: Any, value: str) -> None:
+    """Raise UserError for a word that is no value of a type or of a Literal."""
+    if get_origin(kind) is Literal:
+        choices = [str(one) for one in get_args(kind)]
+        if value in choices:
+            return
+        near = get_close_matches(value, choices, 1)
+        hint = f": did you mean {near[0]}?" if near else ""
+        raise UserError(
+            f"{name} takes {', '.join(choices[:-1])} or {choices[-1]}, not {value[:60]!r}{hint}"
+        )
+    if kind in _TAKES:
+        try:
+            kind(value)
+        except ValueError:
+            raise UserError(f"{name} takes {_TAKES[kind]}, not {value[:60]!r}") from None
 
 
 def _without_commas(option: Option, values: Sequence[str]) -> list[str]:
@@ -316,16 +454,13 @@ def _without_commas(option: Option, values: Sequence[str]) -> list[str]:
     marks = ","
     if len(option.kinds) > 1:  # 640x480, digit=5
         marks += "=" if str in option.kinds else "x"
-    if not any(mark in value for value in values for mark in marks) or any(
-        Path(value).exists() for value in values
-    ):
+    if not any(mark in value for value in values for mark in marks):
         return []
-    right = [
-        word
-        for value in values
-        for word in re.split(rf"[{marks}\s]+", value.strip("[]() "))
-        if word
-    ]
+    if any(Path(value).exists() for value in values):
+        return []  # a name may hold a comma
+    right = []
+    for value in values:
+        right += [word for word in re.split(rf"[{marks}\s]+", value.strip("[]() ")) if word]
     # a text may hold a comma
     fits = not option.is_list and len(values) == len(option.kinds)
     if fits and str in option.kinds:

@@ -401,8 +401,7 @@ def run_verify(options: VerifyOptions) -> int:
         target = output.write_new(commercial.manifest, options.commercial_only)
         print(
             f"{target}: {len(commercial.manifest):,} rows, without {commercial.non_commercial:,} "
-            "non-commercial rows "
-            f"and {commercial.unknown:,} rows of unknown licence"
+            f"non-commercial rows and {commercial.unknown:,} rows of unknown licence"
         )
     if errors:
         return 1

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from anytouch_jax.encoder.encoder import Encoder
+    from anytouch_jax.weights.safetensors import Loaded
 
 _INT8 = ("int8", "data", "fields")
 # What two networks must share to be interpolated.
@@ -39,9 +40,11 @@ class ExportOptions:
     Example: anytouch export --model runs/stage2 --out encoder.bin --frames 3
 
     The first two take uint8 frames and sensor rows, and return features. OUT.json describes how to
-    call them. They are compared with the live model before they are written. Example: anytouch
-    export --to onnx --out encoder.onnx --int8 --data manifest.parquet Example: anytouch export --to
-    safetensors --model runs/stage2 --out weights.safetensors
+    call them. They are compared with the live model before they are written.
+
+    Example: anytouch export --to onnx --out encoder.onnx --int8 --data manifest.parquet
+
+    Example: anytouch export --to safetensors --model runs/stage2 --out weights.safetensors
     """
 
     model: Path  # Run folder or weights file (.pth, .safetensors).
@@ -84,15 +87,17 @@ def run(options: ExportOptions) -> int:
     refuse_unused(options, ("notes",), "without --card")
     if options.out is None:
         raise UserError("Name the file to write with --out, or a folder to upload with --card.")
-    if options.to not in ("jax", "onnx"):
-        refuse_unused(
-            options,
-            ("frames", "platforms", "pooling", "join", "dtype", *_INT8),
-            f"with --to {options.to}",
-        )
-        return _export_weights(options)
-    onnx = options.to == "onnx"
-    foreign = ("platforms", "join", "dtype") if onnx else _INT8
+    if options.to in ("jax", "onnx"):
+        return _export_encoder(options, options.out)
+    unused = ("frames", "platforms", "pooling", "join", "dtype", *_INT8)
+    refuse_unused(options, unused, f"with --to {options.to}")
+    return _export_weights(options, options.out)
+
+
+def _export_encoder(options: ExportOptions, out: Path) -> int:
+    """Write the touch encoder as a program, for jax or as ONNX."""
+    is_onnx = options.to == "onnx"
+    foreign = ("platforms", "join", "dtype") if is_onnx else _INT8
     refuse_unused(options, ("between", "share", *foreign), f"with --to {options.to}")
     if options.int8 != bool(options.data):
         raise UserError(
@@ -100,24 +105,27 @@ def run(options: ExportOptions) -> int:
             "neither."
         )
     from anytouch_jax.encoder.encoder import load_encoder
-    from anytouch_jax.export.export import describes, export
+    from anytouch_jax.export import export as exports
     from anytouch_jax.train.mesh import enable_compilation_cache
 
-    check_folder(options.out, read=(options.model, *options.data), suffix=".onnx" if onnx else "")
+    check_folder(out, read=(options.model, *options.data), suffix=".onnx" if is_onnx else "")
     enable_compilation_cache()
-    encoder = load_encoder(options.model).computed_in("float32" if onnx else options.dtype)
+    encoder = load_encoder(options.model).computed_in("float32" if is_onnx else options.dtype)
     refuse_join(options, encoder.config.model.frames)
-    names = ("frames", "platforms", "pooling", "join")
-    about = export(
-        encoder,
-        options.out,
-        form="onnx" if onnx else "jax",
+    settings = exports.ExportSettings(
+        form="onnx" if is_onnx else "jax",
+        frames=options.frames,
+        platforms=options.platforms,
+        pooling=options.pooling,
+        join=options.join,
         fields=options.fields,
-        **(_calibration(encoder, options) if options.int8 else {}),
-        **{name: getattr(options, name) for name in names},
     )
+    if options.int8:
+        touches, gels = _calibration(encoder, options)
+        settings = replace(settings, calibration=touches, gels=gels)
+    about = exports.export_with(encoder, out, settings)
     print(
-        f"{options.out}: {about['bytes'] / 1e6:.1f} MB for {', '.join(about['platforms'])}; "
+        f"{out}: {about['bytes'] / 1e6:.1f} MB for {', '.join(about['platforms'])}; "
         f"{about['input']}"
     )
     print(
@@ -125,53 +133,57 @@ def run(options: ExportOptions) -> int:
         "feature"
     )
     if options.int8:
+        measured = about["int8"]
         print(
-            "in int8 {worst_difference:.1e}, mean cosine {cosine:.4f}, on {touches} touches".format(
-                **about["int8"]
-            )
+            f"in int8 {measured['worst_difference']:.1e}, mean cosine {measured['cosine']:.4f}, "
+            f"on {measured['touches']} touches"
         )
-    print(f"{describes(options.out)}: how to call it")
+    print(f"{exports.describes(out)}: how to call it")
     return 0
 
 
-def _calibration(encoder: Encoder, options: ExportOptions) -> dict[str, Any]:
-    """Return `export`'s touches u8 (200, T, H, W, 3) with sensor rows i32 (200,), evenly spaced,
-    and untouched gels.
+def _calibration(
+    encoder: Encoder, options: ExportOptions
+) -> tuple[tuple[np.ndarray, np.ndarray], dict[str, np.ndarray] | None]:
+    """Return the touches that int8 is calibrated on, and pictures of their untouched gels.
+
+    Touches are u8 (200, T, H, W, 3), evenly spaced over the rows, with sensor rows i32 (200,).
     """
     import numpy as np
 
-    from anytouch_jax.cli.embed import usable_rows
+    from anytouch_jax.cli.inputs import usable_rows
     from anytouch_jax.data.background.rule import UnitGels
     from anytouch_jax.data.manifest import manifest as manifests
-    from anytouch_jax.encoder.embed import embed_rows, rows_with_gel
+    from anytouch_jax.encoder.embed import RowSettings, embed_with, rows_with_gel
     from anytouch_jax.export.engines import CALIBRATION
 
     manifest = manifests.read(options.data)
-    clips = list[np.ndarray]()
     gels = UnitGels(manifest)
-    rows = rows_with_gel(
-        encoder, gels, usable_rows(manifest, np.arange(len(manifest)), options.frames), log
-    )
+    rows = usable_rows(manifest, np.arange(len(manifest)), options.frames)
+    rows = rows_with_gel(encoder, gels, rows, log)
     if len(rows) < CALIBRATION:
         raise UserError(
             f"--int8 needs {CALIBRATION} touches and --data has {len(rows)}. Name more manifests."
         )
     rows = rows[np.linspace(0, len(rows) - 1, CALIBRATION).astype(int)]
+    clips = list[np.ndarray]()
 
     def keep(part: np.ndarray, _: np.ndarray) -> np.ndarray:
         clips.append(part)
         return part
 
-    given, _ = embed_rows(encoder, manifest, rows, options.frames, edit=keep, gels=gels, log=log)
+    # The touches are those that `embed` would encode, prepared and background-subtracted.
+    settings = RowSettings(frames=options.frames, edit=keep)
+    given, _ = embed_with(encoder, manifest, rows, settings, gels=gels, log=log)
     sensors = manifest.text_column("sensor")[given]
+    # `embed_with` has logged unknown sensors already.
     ids = np.array([encoder.sensor_row(name, lambda _: None) for name in sensors], np.int32)
-    return {
-        "calibration": (np.concatenate(clips), ids),
-        "gels": gels.pictures(given) if encoder.subtracts else None,
-    }
+    pictures = gels.pictures(given) if encoder.subtracts else None
+    return (np.concatenate(clips), ids), pictures
 
 
 def _export_card(options: ExportOptions, folder: Path) -> int:
+    """Write a folder to upload."""
     from anytouch_jax.encoder.encoder import find_tokenizer
     from anytouch_jax.weights import load, registry
 
@@ -201,69 +213,94 @@ def _export_card(options: ExportOptions, folder: Path) -> int:
     return 0
 
 
-def _export_weights(options: ExportOptions) -> int:
-    assert options.out is not None
-    from anytouch_jax.weights import convert, load, safetensors, tree
+def _export_weights(options: ExportOptions, out: Path) -> int:
+    """Write all weights, by this package's names or by those of the authors' files."""
+    from anytouch_jax.weights import load, safetensors
 
-    source = options.model
-    before = options.between
-    if before is None:
+    if options.between is None:
         refuse_unused(options, ("share",), "without --between")
-    read = [path for path in (source, before) if path is not None and not path.is_dir()]
-    check_folder(options.out, read=read, suffix=".safetensors")
-    loaded = load.load_model(source, stored_rows=True)
+    read = [path for path in (options.model, options.between) if path and not path.is_dir()]
+    check_folder(out, read=read, suffix=".safetensors")
+    loaded = load.load_model(options.model, stored_rows=True)
     params = loaded.params
-    model = loaded.config.model
     about = loaded.export_metadata()
-    if before is not None:
-        other = load.load_model(before, stored_rows=True)
-        differ = [
-            name for name in _SAME if getattr(other.config.model, name) != getattr(model, name)
-        ]
-        grounds = [
-            one.get(safetensors.BACKGROUND_KEY, "keep") for one in (other.export_metadata(), about)
-        ]
-        if differ := differ + ["background"] * (grounds[0] != grounds[1]):
-            raise UserError(
-                f"{before} and {source} have different networks ({', '.join(differ)}). --between "
-                "takes the run that "
-                "MODEL was trained from."
-            )
-        params = tree.interpolate(other.params, params, options.share)
-        about |= {"source": f"{options.share:g} of the way from {before} to {source}"}
-    if options.to == "safetensors":
-        safetensors.export_safetensors(
-            options.out, params, about | {safetensors.MODEL_KEY: to_json(model)}
-        )
+    if options.between is not None:
+        params = _interpolated(options, options.between, loaded)
+        about["source"] = f"{options.share:g} of the way from {options.between} to {options.model}"
+    if options.to == "release":
+        _write_release(options, out, params, loaded.config.model, about)
     else:
-        if not {"touch", "decoder"} <= params.keys():
-            raise UserError(
-                f"{source} lacks the touch encoder or decoder of the authors' files. Use --to "
-                "safetensors."
-            )
-        params, model = _universal_last(params, model)
-        if "matcher" in params and model.match_head == "mlp":
-            log(
-                "the matching MLP of recipe paper is stored as cross_sensor_mlp.*, which the "
-                "authors' code ignores"
-            )
-        if params.pop("force", None) is not None:
-            log(
-                "the force heads are left out: the authors' files have none. Use --to safetensors "
-                "to keep them."
-            )
-        about |= {safetensors.MODEL_KEY: to_json(model), "format": "pt"}
-        arrays = convert.to_release(params, model, allow_extra=True)
-        safetensors.write_safetensors(options.out, arrays, about)
-    print(f"{options.out}: written")
+        about[safetensors.MODEL_KEY] = to_json(loaded.config.model)
+        safetensors.export_safetensors(out, params, about)
+    print(f"{out}: written")
     return 0
+
+
+def _interpolated(options: ExportOptions, before: Path, loaded: Loaded) -> dict[str, Any]:
+    """Return parameters between those of a run `before` and those `loaded`.
+
+    Raises UserError for two networks.
+    """
+    from anytouch_jax.weights import load, safetensors, tree
+
+    other = load.load_model(before, stored_rows=True)
+    ours = loaded.config.model
+    theirs = other.config.model
+    differ = [name for name in _SAME if getattr(theirs, name) != getattr(ours, name)]
+    grounds = [
+        one.export_metadata().get(safetensors.BACKGROUND_KEY, "keep") for one in (other, loaded)
+    ]
+    if grounds[0] != grounds[1]:
+        differ.append("background")
+    if differ:
+        raise UserError(
+            f"{before} and {options.model} have different networks ({', '.join(differ)}). "
+            "--between takes the run that MODEL was trained from."
+        )
+    return tree.interpolate(other.params, loaded.params, options.share)
+
+
+def _write_release(
+    options: ExportOptions,
+    out: Path,
+    params: dict[str, Any],
+    model: ModelConfig,
+    about: dict[str, str],
+) -> None:
+    """Write weights by the names of the authors' files, and log what these do not have.
+
+    Raises UserError without a touch encoder and a decoder.
+    """
+    from anytouch_jax.weights import convert, safetensors
+
+    if not {"touch", "decoder"} <= params.keys():
+        raise UserError(
+            f"{options.model} lacks the touch encoder or decoder of the authors' files. Use --to "
+            "safetensors."
+        )
+    params, model = _universal_last(params, model)
+    if "matcher" in params and model.match_head == "mlp":
+        log(
+            "the matching MLP of recipe paper is stored as cross_sensor_mlp.*, which the "
+            "authors' code ignores"
+        )
+    if "force" in params:
+        params = {name: part for name, part in params.items() if name != "force"}
+        log(
+            "the force heads are left out: the authors' files have none. Use --to safetensors "
+            "to keep them."
+        )
+    arrays = convert.to_release(params, model, allow_extra=True)
+    metadata = about | {safetensors.MODEL_KEY: to_json(model), "format": "pt"}
+    safetensors.write_safetensors(out, arrays, metadata)
 
 
 def _universal_last(
     params: dict[str, Any], model: ModelConfig
 ) -> tuple[dict[str, Any], ModelConfig]:
-    """Return the same model with its universal tokens in the last row, where the authors' code
-    reads them (id -1).
+    """Return the same model with its universal tokens in the last row.
+
+    The authors' code reads them there (id -1).
     """
     import numpy as np
 
@@ -273,6 +310,5 @@ def _universal_last(
         return params, model
     names = (*(name for name in model.sensors if name != UNIVERSAL), UNIVERSAL)
     rows = match_sensors(np.asarray(params["touch"]["sensor_tokens"]), model.sensors, names)
-    return params | {"touch": params["touch"] | {"sensor_tokens": rows}}, replace(
-        model, sensors=names
-    )
+    touch = params["touch"] | {"sensor_tokens": rows}
+    return params | {"touch": touch}, replace(model, sensors=names)

@@ -59,7 +59,7 @@ def _health(options: InfoOptions) -> int:
     Exit status 1 reports a fault.
     """
     from anytouch_jax.data.manifest import manifest as manifests
-    from anytouch_jax.evaluate.statistics import markdown_table
+    from anytouch_jax.evaluate.tables import markdown_table
     from anytouch_jax.live import health
 
     check_folder(options.picture, "--picture", read=options.paths, suffix=".png")
@@ -121,19 +121,28 @@ def _seen_by(model: Path, table: Manifest, unit: UnitHealth) -> UnitHealth:
     )
 
 
-def _lines(path: Path) -> list[str]:
+def _of_a_word(word: str) -> list[str]:
+    """Return lines about the encoders, one of them by its name, or the cameras, [] for no such
+    word.
+    """
     from anytouch_jax.weights import registry
 
-    if str(path) == "encoders":
+    if word == "encoders":
         return [_named(name) for name in registry.list_encoders()]
-    if str(path) in registry.list_encoders():
-        return [_named(str(path)), *_weights(registry.locate(path))]
-    if str(path) == "cameras":
-        from anytouch_jax.live.cameras import list_cameras
+    if word in registry.list_encoders():
+        return [_named(word), *_weights(registry.locate(word))]
+    if word == "cameras":
+        from anytouch_jax.live.cameras import describe_cameras
 
-        return [line for camera in list_cameras() for line in camera.lines()] or [
-            "no camera is connected"
-        ]
+        return describe_cameras() or ["no camera is connected"]
+    return []
+
+
+def _lines(path: Path) -> list[str]:
+    """Return lines about whatever a user names. Raises UserError for what is of no known kind."""
+    lines = _of_a_word(str(path))
+    if lines:
+        return lines
     if not path.exists():
         raise UserError(f"there is no {path}. Name a file, a folder or an encoder.")
     suffix = path.suffix.lower()
@@ -290,8 +299,8 @@ def _model(model: ModelConfig, *, heads_known: bool = True) -> str:
     heads = f"{model.touch.heads} heads" if heads_known else "heads unknown"
     return (
         f"touch encoder: width {model.touch.width}, depth {model.touch.depth}, {heads}, images of "
-        f"{model.image_size} "
-        f"pixels, {model.patch_encoder} patches of {model.patch}, {model.embed} features"
+        f"{model.image_size} pixels, {model.patch_encoder} patches of {model.patch}, {model.embed} "
+        "features"
     )
 
 
@@ -355,8 +364,7 @@ def _manifest(path: Path) -> list[str]:
     labels = [name.removeprefix("label.") for name in summary.filled if name.startswith("label.")]
     return [
         f"{path}: a manifest of {summary.rows:,} rows in {summary.recordings:,} recordings, "
-        f"{summary.clips:,} clips of "
-        "three frames",
+        f"{summary.clips:,} clips of three frames",
         f"splits: {counts('split')}",
         f"sensors: {counts('sensor')}",
         f"rows with {', '.join(filled) or 'no optional column'}",
@@ -387,8 +395,7 @@ def _arrays(path: Path) -> list[str]:
         return [
             f"{path}: a linear head for {head.label}: {', '.join(head.classes)}",
             f"for features of {len(head.mean)} with --pooling {head.pooling} --frames "
-            f"{head.frames}, "
-            f"encoder {head.fingerprint}",
+            f"{head.frames}, encoder {head.fingerprint}",
             *(head.promises() or ["without calibration: save it again"]),
         ]
     if not {"features", "rows"} <= arrays.keys():

@@ -1,52 +1,65 @@
-"""`anytouch measure`: depth, shear, contact and force of a manifest, a folder of frames, a picture
-or a video.
-"""
+"""`anytouch measure`: depth, shear, contact and force of manifests, folders and videos."""
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Iterator
+import contextlib
+import signal
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import groupby, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from anytouch_jax.cli import embed
+from anytouch_jax.cli import inputs
 from anytouch_jax.cli.output import check_apart, check_folder, log
 from anytouch_jax.config.parsing import Above0
-from anytouch_jax.errors import UserError
+from anytouch_jax.errors import UserError, handled
 from anytouch_jax.progress import tracked
 
 if TYPE_CHECKING:
     import numpy as np
 
+    from anytouch_jax.data.manifest.manifest import Manifest
     from anytouch_jax.encoder.encoder import Encoder
-    from anytouch_jax.fields.measure import Fields
+    from anytouch_jax.encoder.measured import Fields
+    from anytouch_jax.fields.film import Film
+    from anytouch_jax.fields.results import Results
 
 _BATCH = 16  # frames, which are whole pictures of the camera
+_INTERRUPTED = 130  # exit status
 
 
 @dataclass(frozen=True, kw_only=True)
-class MeasureOptions(embed.SensorOptions):
+class MeasureOptions(inputs.SensorOptions):
     """Measure depth, shear, contact area and force in mm and N, with standard deviations.
 
     Example: anytouch measure --data press.mp4 --sensor digit --background gel.png --out press.npz
 
     OUT.csv, next to the .npz, has a line a frame: force, torque, depth, area, centre and slip.
+    Ctrl-C ends the measurement, and what was measured is written.
     """
 
-    # Manifests (.csv, .parquet), or one folder of frames, picture or video.
+    # Manifests (.csv, .parquet), or one folder of frames, stack (.npy, .npz), picture or video.
     data: tuple[Path, ...]
     # The .npz to write, with maps of every frame. Its numbers go to a .csv of the same name.
     out: Path
     width_mm: Above0[float | None] = None
-    """What the width of the picture shows, in mm. Known sensors need none. For others lengths are
-    else shares of it.
+    """What the width of the picture shows, in mm. Known and fitted sensors need none. For others
+    lengths are else shares of it.
     """
     split: str | None = None  # Only this split of a manifest.
-    film: Path | None = None  # Film of the frames with depth, shear and force (.mp4, .avi).
-    ply: Path | None = None  # Surface of the deepest frame, a mesh in mm (.ply).
+    # Film of the frames with depth, shear and force (.mp4, .avi), at the rate of the recording.
+    film: Path | None = None
+    ply: Path | None = None
+    """Surface of the deepest frame, a mesh in mm (.ply): x to the right, y down, z away from the
+    camera.
+    """
+
+    @property
+    def table(self) -> Path:
+        """The CSV file of numbers."""
+        return self.out.with_suffix(".csv")
 
 
 class _Touch(NamedTuple):
@@ -59,86 +72,150 @@ class _Touch(NamedTuple):
     background: np.ndarray | None
 
 
+class _Work(NamedTuple):
+    """What is measured by which encoder, and the frames a second of a film of it."""
+
+    options: MeasureOptions
+    encoder: Encoder
+    touches: Iterator[_Touch]
+    rate: float
+    is_manifest: bool
+
+
+class _Deepest(NamedTuple):
+    """The deepest frame so far, RGB u8 (h, w, 3), and its fields."""
+
+    depth: float
+    frame: np.ndarray
+    measured: Fields
+
+
 def run(options: MeasureOptions) -> int:
-    """Write maps, numbers, and if asked a film and a surface."""
-    import numpy as np
+    """Write maps, numbers, and if asked a film and a surface; 130 after Ctrl-C."""
+    from anytouch_jax.fields.film import Film
+    from anytouch_jax.fields.results import Results
 
+    work = _resolve(options)
+    with contextlib.ExitStack() as stack:
+        results = stack.enter_context(contextlib.closing(Results(options.out)))
+        film = None
+        if options.film is not None:
+            film = stack.enter_context(contextlib.closing(Film(options.film, work.rate)))
+        deepest, is_whole = _measure(work, results, film)
+        if not len(results):
+            raise UserError(
+                f"there are no frames to measure in {options.data[0]}. Check the path, and --split."
+            )
+        out, table = _write(work, results, film, deepest, is_whole=is_whole)
+        if not work.is_manifest:
+            inputs.log_universal(work.encoder, options)
+        print(f"{out} and {table}: {len(results)} frames")
+    if is_whole:
+        return 0
+    log("interrupted: only the frames up to then were measured")
+    return _INTERRUPTED
+
+
+def _resolve(options: MeasureOptions) -> _Work:
+    """Return what the options ask for, before any work.
+
+    Mistakes in words and paths are named before the encoder is loaded. Raises UserError.
+    """
     from anytouch_jax.encoder.encoder import load_encoder
-    from anytouch_jax.fields import measure as fields
-    from anytouch_jax.files import atomic_path
+    from anytouch_jax.encoder.measured import missing
 
-    is_manifest = embed.takes_manifest(options, options.data, ("split",))
-    table = options.out.with_suffix(".csv")
+    is_manifest = inputs.takes_manifest(options, options.data, ("split",))
     read = (options.model, *options.data)
     check_folder(options.out, read=read, suffix=".npz")
-    check_folder(table, read=read)
+    check_folder(options.table, read=read)
     check_folder(options.ply, "--ply", read=read, suffix=".ply")
     if options.film is not None:
-        check_folder(
-            options.film,
-            "--film",
-            read=read,
-            suffix=".avi" if options.film.suffix == ".avi" else ".mp4",
-        )
+        suffix = ".avi" if options.film.suffix == ".avi" else ".mp4"
+        check_folder(options.film, "--film", read=read, suffix=suffix)
     check_apart(out=options.out, film=options.film, ply=options.ply)
+    inputs.check_sensor(options)
     encoder = load_encoder(options.model)
     if not encoder.measures:
-        raise fields.missing(encoder.source)
-    touches = (_of_manifest if is_manifest else _of_frames)(encoder, options)
-    parts = list[fields.Fields]()
-    names = list[str]()
-    times = list[float]()
-    lines = list[dict[str, Any]]()
-    deepest: tuple[float, Any, Any] = (-np.inf, None, None)
-    film = None if options.film is None else _Film(options.film)
-    for some, measured in _measured(encoder, touches, options.width_mm):
-        parts.append(measured)
-        for row, touch in enumerate(some):
-            line = measured.summary(row)
-            names.append(touch.name)
-            times.append(touch.time)
-            lines.append(
-                {
-                    "frame": touch.name,
-                    "time": None if touch.time != touch.time else touch.time,
-                    **line,
-                }
-            )
-            if film is not None:
-                film.add(fields.overlay(touch.frames[-1], measured, row))
-            if line["depth"] > deepest[0]:
-                deepest = line["depth"], touch.frames[-1], measured[row]
-    if film is not None:
-        film.close()
-    if not lines:
-        raise UserError(
-            f"there are no frames to measure in {options.data[0]}. Check the path, and --split."
-        )
-    if options.ply is not None:
-        fields.write_surface(options.ply, *deepest[1:])
-    with atomic_path(table) as part, open(part, "w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(lines[0]))
-        writer.writeheader()
-        writer.writerows(lines)
-    arrays: dict[str, Any] = fields.stacked(parts) | {
-        "name": np.array(names),
-        "time": np.array(times),
-    }
-    arrays |= {
-        "about/encoder": np.array(encoder.source),
-        "about/weights": np.array(encoder.fingerprint),
-    }
-    with atomic_path(options.out) as part, open(part, "wb") as file:
-        np.savez(file, **arrays)
-    if not is_manifest:
-        embed.log_universal(encoder, options)
-    print(f"{options.out} and {table}: {len(lines)} frames")
-    return 0
+        raise missing(encoder.source)
+    if is_manifest:
+        from anytouch_jax.data.manifest import manifest as manifests
+
+        manifest = manifests.read(options.data)
+        touches = _of_manifest(encoder, options, manifest)
+        return _Work(options, encoder, touches, _rate_of_rows(manifest), is_manifest)
+    touches = _of_frames(encoder, options)
+    return _Work(options, encoder, touches, _rate_of_frames(options.data[0]), is_manifest)
+
+
+def _measure(work: _Work, results: Results, film: Film | None) -> tuple[_Deepest | None, bool]:
+    """Write the fields of all touches as they come.
+
+    Return the deepest frame, and whether nothing interrupted it. The first Ctrl-C, or SIGTERM, lets
+    the batch at hand end, so that all results have the same frames.
+    """
+    from anytouch_jax.fields.pictures import overlay
+
+    deepest: _Deepest | None = None
+    asked = list[int]()
+
+    def stop(number: int, _: Any) -> None:
+        if asked:
+            raise KeyboardInterrupt
+        asked.append(number)
+
+    batches = _measured(work.encoder, work.touches, work.options.width_mm)
+    with handled(stop, signal.SIGINT, signal.SIGTERM):
+        for touches, measured in batches:
+            names = [touch.name for touch in touches]
+            results.add(measured, names, [touch.time for touch in touches])
+            for row, touch in enumerate(touches):
+                frame = touch.frames[-1]
+                depth = float(measured.depth[row].max())
+                if deepest is None or depth > deepest.depth:
+                    deepest = _Deepest(depth, frame, measured[row])
+                if film is not None:
+                    film.add(overlay(frame, measured, row))
+            if asked:
+                return deepest, False
+    return deepest, True
+
+
+def _write(
+    work: _Work,
+    results: Results,
+    film: Film | None,
+    deepest: _Deepest | None,
+    *,
+    is_whole: bool,
+) -> tuple[Path, Path]:
+    """Move the results to their places, and return those of maps and numbers.
+
+    Results of a part do not replace a file that is there: they get the name NAME.part.
+    """
+    from anytouch_jax.fields.pictures import write_surface
+
+    options = work.options
+
+    def place(path: Path) -> Path:
+        if is_whole or not path.exists():
+            return path
+        return path.with_stem(f"{path.stem}.part")
+
+    out = place(options.out)
+    table = place(options.table)
+    about = {"encoder": work.encoder.source, "weights": work.encoder.fingerprint}
+    results.save(out, table, about)
+    if options.ply is not None and deepest is not None:
+        write_surface(place(options.ply), deepest.frame, deepest.measured)
+    # Last, because only a film may turn out to be unwritable at its end.
+    if film is not None and options.film is not None:
+        film.finish(place(options.film))
+    return out, table
 
 
 def _measured(
     encoder: Encoder, touches: Iterator[_Touch], width_mm: float | None
-) -> Iterator[tuple[tuple[_Touch, ...], Fields]]:
+) -> Iterator[tuple[Sequence[_Touch], Fields]]:
     """Yield touches of one sensor, background and size in batches, and their fields.
 
     Each warning is logged once.
@@ -158,46 +235,47 @@ def _measured(
         while part := tuple(islice(group, _BATCH)):
             frames = np.stack([touch.frames for touch in part])
             first = part[0]
-            yield (
-                part,
-                encoder.measure(
-                    frames, first.background, first.sensor, width_mm=width_mm, log=once
-                ),
+            measured = encoder.measure(
+                frames, first.background, first.sensor, width_mm=width_mm, log=once
             )
+            yield part, measured
 
 
 def _of_frames(encoder: Encoder, options: MeasureOptions) -> Iterator[_Touch]:
-    """Yield every frame of a folder, a picture or a video. Before the first frame nothing moved."""
+    """Yield every frame of a folder, a stack, a picture or a video."""
     import numpy as np
 
     from anytouch_jax.config import UNIVERSAL
-    from anytouch_jax.data.images import count_frames
     from anytouch_jax.data.transforms import orient_frame
 
     data = options.data[0]
     length = encoder.config.model.frames
-    gel, _ = embed.choose_gel(encoder, options.background, data, {})
+    gel, _ = inputs.choose_gel(encoder, options.background, data, {})
+    background = None
+    if gel is not None:
+        background = orient_frame(gel, options.rotate, options.flip)
     times = list[float]()
     ring = list[np.ndarray]()
     last = -1
-    background = None if gel is None else orient_frame(gel, options.rotate, options.flip)
     for number, name, frame in tracked(
-        embed.numbered_frames(data, "error", times), "frames measured", count_frames(data)
+        inputs.numbered_frames(data, "error", times), "frames measured", inputs.count_frames(data)
     ):
         assert frame is not None  # an unreadable one is an error
         frame = np.ascontiguousarray(orient_frame(frame, options.rotate, options.flip))
-        is_next = number == last + 1 and ring and ring[-1].shape == frame.shape
-        ring = [*(ring if is_next else [frame] * length), frame][-length:]
+        follows = number == last + 1 and ring and ring[-1].shape == frame.shape
+        if not follows:
+            # Before the first frame nothing moved.
+            ring = [frame] * length
+        ring = [*ring, frame][-length:]
         last = number
         time = times[-1] if times else float("nan")
-        yield _Touch(
-            name or str(number), time, np.stack(ring), options.sensor or UNIVERSAL, background
-        )
+        frames = np.stack(ring)
+        yield _Touch(name or str(number), time, frames, options.sensor or UNIVERSAL, background)
     if times:
-        embed.log_if_cut(data, len(times))
+        inputs.log_if_cut(data, len(times))
 
 
-def _of_manifest(encoder: Encoder, options: MeasureOptions) -> Iterator[_Touch]:
+def _of_manifest(encoder: Encoder, options: MeasureOptions, manifest: Manifest) -> Iterator[_Touch]:
     """Yield the rows of manifests that have images.
 
     Before the first frame of a sequence nothing moved.
@@ -206,61 +284,66 @@ def _of_manifest(encoder: Encoder, options: MeasureOptions) -> Iterator[_Touch]:
 
     from anytouch_jax.data.background.rule import UnitGels
     from anytouch_jax.data.images import decode
-    from anytouch_jax.data.manifest import manifest as manifests
     from anytouch_jax.encoder.embed import rows_with_gel
 
-    manifest = manifests.read(options.data)
     length = encoder.config.model.frames
     rows = np.arange(len(manifest)) if options.split is None else manifest.rows_of(options.split)
-    rows = embed.usable_rows(manifest, rows, 1)
+    rows = inputs.usable_rows(manifest, rows, 1)
     gels = UnitGels(manifest)
     if encoder.subtracts:
         log(gels.report(rows))
     rows = rows_with_gel(encoder, gels, rows, log)
     before = {later: earlier for earlier, later in manifest.clips(2).tolist()}
     sensors = manifest.text_column("sensor")
-    picture = lru_cache(length)(decode)
+    picture = lru_cache(length)(decode)  # a frame is in `length` clips, one after the other
     gel_of = gels.shared(lambda gel: gel)
     for row in tracked(rows.tolist(), "frames measured", len(rows)):
         clip = [row]
         while len(clip) < length:
             clip.append(before.get(clip[-1], clip[-1]))
         frames = [picture(manifest.file(one)) for one in reversed(clip)]
+        last = frames[-1]
+        frames = [frame if frame.shape == last.shape else last for frame in frames]
         gel = gel_of(row) if encoder.subtracts else None
-        same = [frame if frame.shape == frames[-1].shape else frames[-1] for frame in frames]
-        yield _Touch(
-            str(manifest.column("path")[row].as_py()),
-            float("nan"),
-            np.stack(same),
-            str(sensors[row]),
-            gel,
-        )
+        name = str(manifest.column("path")[row].as_py())
+        yield _Touch(name, float("nan"), np.stack(frames), str(sensors[row]), gel)
 
 
-class _Film:
-    """A film of pictures RGB u8 of one size, that of the first: others are scaled to it."""
+def _rate_of_frames(data: Path) -> float:
+    """Return the frames a second of a video; a folder, a stack or a picture has a usual rate."""
+    import cv2
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._size = (0, 0)
-        self._writer: Any = None
+    from anytouch_jax.data import images, stacks
+    from anytouch_jax.fields.film import RATE
 
-    def add(self, picture: np.ndarray) -> None:
-        import cv2
+    if stacks.read_stack(data) is not None or images.picture_files(data) is not None:
+        return RATE
+    video = images.open_video(data)
+    try:
+        rate = float(video.get(cv2.CAP_PROP_FPS))
+    finally:
+        video.release()
+    return rate if _is_rate(rate) else RATE
 
-        if self._writer is None:
-            code = "MJPG" if self._path.suffix == ".avi" else "mp4v"
-            self._size = (picture.shape[1], picture.shape[0])
-            self._writer = cv2.VideoWriter(
-                str(self._path), cv2.VideoWriter.fourcc(*code), 30, self._size
-            )
-            if not self._writer.isOpened():
-                raise UserError(
-                    f"{self._path} cannot be written as a film on this computer. Name an .avi file."
-                )
-        shown = picture if picture.shape[1::-1] == self._size else cv2.resize(picture, self._size)
-        self._writer.write(shown[..., ::-1])
 
-    def close(self) -> None:
-        if self._writer is not None:
-            self._writer.release()
+def _rate_of_rows(manifest: Manifest) -> float:
+    """Return the frames a second of the time stamps of a manifest, a usual rate without any."""
+    import numpy as np
+
+    from anytouch_jax.fields.film import RATE
+
+    times = np.zeros(0)
+    with contextlib.suppress(UserError):  # of text: the column is the user's own
+        times = manifest.number_column("timestamp")
+    pairs = manifest.clips(2)
+    if not len(times) or not len(pairs):
+        return RATE
+    steps = times[pairs[:, 1]] - times[pairs[:, 0]]
+    steps = steps[np.isfinite(steps) & (steps > 0)]
+    rate = 1 / float(np.median(steps)) if len(steps) else 0.0
+    return rate if _is_rate(rate) else RATE
+
+
+def _is_rate(rate: float) -> bool:
+    """Whether a number is one of frames a second, and not a header's rubbish."""
+    return 0.1 <= rate <= 1000

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -16,10 +17,14 @@ if TYPE_CHECKING:
 
 
 def log(sentence: str) -> None:
-    """Print a sentence that is not a result on standard error."""
-    from rich.console import Console
+    """Print a sentence that is not a result on standard error.
 
-    Console(stderr=True, highlight=False).print(shorten(sentence), markup=False, soft_wrap=True)
+    Not by a console of rich: it would write past the bar that may be on the terminal, at the end of
+    its line, and the bar would be drawn over it. The bar takes what goes to `sys.stderr`, and shows
+    it above itself.
+    """
+    sys.stderr.write(shorten(sentence) + "\n")
+    sys.stderr.flush()
 
 
 def print_table(markdown: str) -> None:
@@ -41,22 +46,20 @@ def log_default(models: Sequence[Path]) -> None:
 
 
 def refuse_unused(options: Any, names: Sequence[str], reason: str) -> None:
-    """Raise UserError for those of the options `names` that were changed; `reason` ends "has no
-    effect".
+    """Raise UserError for those of the options `names` that were changed.
+
+    `reason` ends a sentence that begins "has no effect". An option without effect is refused,
+    because a user who gives it expects one.
     """
     defaults = {field.name: field.default for field in fields(options)}
     changed = [spelled(name) for name in names if getattr(options, name) != defaults[name]]
     if changed:
-        raise UserError(
-            f"{', '.join(changed)} {'has' if len(changed) == 1 else 'have'} no effect {reason}. "
-            "Remove it."
-        )
+        verb = "has" if len(changed) == 1 else "have"
+        raise UserError(f"{', '.join(changed)} {verb} no effect {reason}. Remove it.")
 
 
 def refuse_join(options: Any, segment: int) -> None:
-    """Raise UserError for --join where a touch of `options.frames` frames is one segment, of
-    `segment` at most.
-    """
+    """Raise UserError for --join where a touch is one segment, of `segment` frames at most."""
     if (options.frames or 1) <= segment:
         refuse_unused(
             options, ("join",), f"on touches of up to {segment} frames, which have one segment"
@@ -65,15 +68,15 @@ def refuse_join(options: Any, segment: int) -> None:
 
 def default_target(manifest: Path, word: str, suffix: str | None = None) -> Path:
     """Return the default place of a result: `<name>_<word>` in the folder of `manifest`."""
-    return manifest.with_name(
-        f"{manifest.stem}_{word}{manifest.suffix if suffix is None else suffix}"
-    )
+    if suffix is None:
+        suffix = manifest.suffix
+    return manifest.with_name(f"{manifest.stem}_{word}{suffix}")
 
 
 def check_new(manifest: Manifest, path: Path) -> Path:
     """Return the absolute path of a manifest that `write_new` can write.
 
-    Raises UserError before long work.
+    Raises UserError, so that long work is not begun for nothing.
     """
     from anytouch_jax.data.manifest import manifest as manifests
     from anytouch_jax.data.manifest.schema import is_manifest
@@ -103,11 +106,17 @@ def write_new(manifest: Manifest, path: Path) -> Path:
 def check_folder(
     path: Path | None, option: str = "--out", *, read: Iterable[str | Path] = (), suffix: str = ""
 ) -> None:
-    """Make the folder of a file that will be written after long work, if there is one; `option`
-    named it.
+    """Make the folder of a file that will be written after long work, if there is one.
 
-    Raises UserError for a folder that cannot be made, and for a name that does not end in `suffix`.
-    So it does for a `path` that is a folder, a device or one of the files that are `read`.
+    Args:
+        path: of the file.
+        option: that named it.
+        read: files that the command reads, which must not be written over.
+        suffix: that its name must have.
+
+    Raises:
+        UserError: for a folder that cannot be made, for another suffix, and for a `path` that is a
+            folder, a device or one of the files that are read.
     """
     if path is None:
         return
@@ -131,12 +140,16 @@ def check_folder(
 
 
 def check_home(folder: Path, option: str = "--out") -> None:
-    """Check a folder that will be filled after long work: its parents are made, the folder itself
-    is not.
+    """Check a folder that will be filled after long work.
+
+    Its parents are made, the folder itself is not: it appears when it is whole.
     """
     if folder.exists() and not folder.is_dir():
         raise UserError(f"{folder} is a file, not a folder. Choose another {option}.")
-    check_folder(folder / "file" if folder.is_dir() else folder, option)
+    if folder.is_dir():
+        check_folder(folder / "file", option)
+    else:
+        check_folder(folder, option)
 
 
 def check_apart(**outputs: Path | None) -> None:

@@ -1,12 +1,13 @@
-"""`anytouch probe`: simple heads on frozen features, for a label column, for tasks, or as a public
-benchmark.
+"""`anytouch probe`: simple heads on frozen features.
+
+They probe a label column, named tasks, or a public benchmark.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from anytouch_jax.cli.arguments import DEFAULT
 from anytouch_jax.cli.output import (
@@ -21,6 +22,10 @@ from anytouch_jax.cli.output import (
 from anytouch_jax.config.parsing import Count, Finite, NotNegative, Range
 from anytouch_jax.errors import UserError
 
+if TYPE_CHECKING:
+    from anytouch_jax.evaluate.options import ProbeOptions as Settings
+
+Record = TypeVar("Record", bound="Settings")
 Inner = Annotated[float, Range(0.001, 0.999, "between 0.001 and 0.999")]
 
 
@@ -49,7 +54,8 @@ class LabelOptions(ProbeOptions):
 
     Use --where label.contact_score 7 for firm touches only, after `anytouch data contact`. The
     penalty is chosen on split val, or by grouped cross-validation inside train. The report is on
-    split test.
+    split test. A manifest without a split, as one of your recordings, has each recording left out
+    in turn.
     """
 
     label: str = "object"  # Label column. The prefix "label." may be left out.
@@ -63,6 +69,8 @@ class LabelOptions(ProbeOptions):
     """
     where: Finite[tuple[str, float] | None] = None  # Keep rows whose column is above a number.
     sensor: str | None = None  # Keep rows of this sensor.
+    train_sensor: str | None = None  # Fit the heads on recordings of this sensor.
+    test_sensor: str | None = None  # Test them on the same classes by this sensor.
     # Frames of a touch: 1 for stills, 3 or more for the clip that ends at each row.
     frames: Count[int] = 1
     # Features: class token, mean of the patch tokens, or both.
@@ -71,6 +79,10 @@ class LabelOptions(ProbeOptions):
     protocol: Literal["honest", "published"] = "honest"
     """published chooses the penalty on the test split, as the authors' code does. The report says
     so.
+    """
+    regression: Literal["auto", "yes", "no"] = "auto"
+    """Whether the label is a number: R2, mean absolute error and Spearman's correlation. By auto it
+    is if the column has numbers with a fraction.
     """
     # Also print parts of the test rows: classes that alignment may have named, and others.
     details: bool = False
@@ -99,21 +111,26 @@ class BatteryOptions(ProbeOptions):
 
 @dataclass(frozen=True)
 class TasksOptions(BatteryOptions):
-    """Probe named tasks: every seed splits the groups again, so that no object or recording is in
-    two splits.
+    """Probe named tasks, with new splits of whole objects and recordings by every seed.
 
     Example: anytouch probe tasks --model runs/stage2 --data manifest.parquet --tasks material slip
     force twist
+
+    No object or recording is in two splits.
     """
 
     tasks: tuple[str, ...] = ("all",)
     """Tasks: material, roughness, hardness, grasp, grasp_after, object, slip, force, twist, slide,
-    indenter, or all.
+    indenter, any other label column of the manifest, or all.
     """
     heads: tuple[Literal["linear", "knn", "gradient"], ...] = ("linear",)
     """Heads. gradient is the authors': one layer trained by AdamW."""
     protocol: Literal["honest", "published"] = "honest"
     """published also reports the choice on the test split, as in the authors' code."""
+    regression: Literal["auto", "yes", "no"] = "auto"
+    """Whether labels are numbers, for tasks that do not say so. By auto they are if the column has
+    numbers with a fraction.
+    """
     frames: Count[int | None] = None  # Frames of a touch (default: those of each task).
     # Features: class token, mean of the patch tokens, or both.
     pooling: Literal["class", "mean", "both"] = "class"
@@ -141,16 +158,20 @@ class BenchmarkOptions(BatteryOptions):
 
 def run_label(options: LabelOptions) -> int:
     """Probe a label column, print a table, and write JSON with --out."""
+    from anytouch_jax.evaluate.options import LabelProbeOptions
     from anytouch_jax.evaluate.probing import probe_label, probe_table
-    from anytouch_jax.evaluate.statistics import label_verdicts
+    from anytouch_jax.evaluate.verdicts import label_verdicts
 
     if options.leave_out is not None:
         refuse_unused(
             options,
-            ("group", "seeds", "protocol", "save"),
+            ("group", "seeds", "protocol"),
             "with --leave-out, which makes its own folds",
         )
-    if options.save is not None and len(_models(options)) != 1:
+    if options.train_sensor is not None:
+        refuse_unused(options, ("seeds", "details"), "with --train-sensor")
+    models = _models(options)
+    if options.save is not None and len(models) != 1:
         raise UserError(
             f"--save writes the head of one encoder. Give one --model, not {len(options.model)}."
         )
@@ -162,38 +183,45 @@ def run_label(options: LabelOptions) -> int:
         )
     check_folder(options.save, "--save", read=_files_read(options), suffix=".npz")
     check_apart(out=options.out, save=options.save)
-    settings = _settings(options)
-    details = settings.pop("details")
-    results = probe_label(**settings, log=log)
+    _prepare(options)
+    settings = _settings(options, LabelProbeOptions)
+    results = probe_label(models, options.data, options=settings, log=log)
     print("".join(f"{line}\n" for line in label_verdicts(results)))
-    print_table(probe_table(results, details=details))
+    print_table(probe_table(results, details=options.details))
     log_default((*options.model, *options.features))
     return 0
 
 
 def run_tasks(options: TasksOptions) -> int:
     """Probe named tasks, print a table, and write JSON with --out."""
-    from anytouch_jax.evaluate.probing import probe_table, probe_tasks
+    from anytouch_jax.evaluate.options import TaskProbeOptions
+    from anytouch_jax.evaluate.probing import probe_tasks
 
     if options.frames is None:
         refuse_unused(options, ("join",), "without --frames: tasks use stills or single segments")
     if options.frames == 1:
         refuse_unused(options, ("order",), "on stills")
-    tasks = {"tasks": "all"} if options.tasks == ("all",) else {}
-    settings = _settings(options) | tasks
-    if settings.pop("counterfactual"):
+    _prepare(options)
+    settings = _settings(options, TaskProbeOptions)
+    if options.counterfactual:
         return _run_counterfactual(options, settings)
-    results = probe_tasks(**settings, log=log)
+    tasks: Any = "all" if options.tasks == ("all",) else options.tasks
+    results = probe_tasks(_models(options), options.data, tasks, options=settings, log=log)
+    return _print_tasks(options, results)
+
+
+def _print_tasks(options: BatteryOptions, results: dict[str, Any]) -> int:
+    """Print the verdicts and the table of tasks."""
+    from anytouch_jax.evaluate.probing import probe_table
+
     print("".join(f"{line}\n" for line in results["verdicts"]))
     print_table(probe_table(results["results"], results["paper"]))
     log_default((*options.model, *options.features))
     return 0
 
 
-def _run_counterfactual(options: TasksOptions, settings: dict[str, Any]) -> int:
-    """Print the scores of real touch and of the controls, their paired differences, and a verdict
-    for each task.
-    """
+def _run_counterfactual(options: TasksOptions, settings: Any) -> int:
+    """Print the scores of real touch and of the controls, and what real touch adds to each."""
     import json
 
     from anytouch_jax.evaluate.counterfactual import gains_table, probe_counterfactual, verdicts
@@ -205,55 +233,59 @@ def _run_counterfactual(options: TasksOptions, settings: dict[str, Any]) -> int:
         ("features", "order", "controls"),
         "with --counterfactual, which makes its own controls",
     )
-    out = settings.pop("out")
-    results, gains = probe_counterfactual(**settings, log=log)
+    tasks: Any = "all" if options.tasks == ("all",) else options.tasks
+    models = _models(options)
+    results, gains = probe_counterfactual(models, options.data, tasks, options=settings, log=log)
     print_table(probe_table(results["results"], results["paper"]))
     print_table(gains_table(gains))
     print("\n" + "\n".join(verdicts(gains)))
-    if out is not None:
-        atomic_write(out, json.dumps(results | {"gains": gains}, indent=2, allow_nan=False))
+    if options.out is not None:
+        atomic_write(options.out, json.dumps(results | {"gains": gains}, indent=2, allow_nan=False))
     log_default(options.model)
     return 0
 
 
 def run_benchmark(options: BenchmarkOptions) -> int:
     """Probe a public benchmark, print a table, and write JSON with --out."""
-    from anytouch_jax.evaluate.probing import probe_benchmark, probe_table
+    from anytouch_jax.evaluate.options import TaskProbeOptions
+    from anytouch_jax.evaluate.probing import probe_benchmark
 
-    results = probe_benchmark(**_settings(options), log=log)
-    print("".join(f"{line}\n" for line in results["verdicts"]))
-    print_table(probe_table(results["results"], results["paper"]))
-    log_default((*options.model, *options.features))
-    return 0
+    _prepare(options)
+    settings = _settings(options, TaskProbeOptions)
+    models = _models(options)
+    results = probe_benchmark(models, options.data, options.benchmark, options=settings, log=log)
+    return _print_tasks(options, results)
 
 
-def _settings(options: ProbeOptions) -> dict[str, Any]:
-    """Return all options by the names that probes take them.
-
-    Check where results go, before the work.
-    """
+def _prepare(options: ProbeOptions) -> None:
+    """Check where results go, before the work, and let programs that are compiled be kept."""
     from anytouch_jax.train.mesh import enable_compilation_cache
 
     check_folder(options.out, read=_files_read(options))
     if isinstance(options, BatteryOptions) and options.cache is not None:
         check_home(options.cache, "--cache")
     enable_compilation_cache()
-    settings = dict(vars(options)) | {"models": _models(options)}
-    del settings["model"]
-    return settings
+
+
+def _settings(options: ProbeOptions, kind: type[Record]) -> Record:
+    """Return the options as the record of a probe, whose fields have the same names."""
+    names = {field.name for field in fields(kind)}
+    return kind(**{name: value for name, value in vars(options).items() if name in names})
 
 
 def _models(options: ProbeOptions) -> tuple[Path, ...]:
-    """Return the encoders to probe: those named, or that of the package if there are no features
-    either.
+    """Return the encoders to probe: those named, or that of the package.
+
+    Features of a file need no encoder.
     """
-    return options.model or (() if options.features else (Path(DEFAULT),))
+    if options.model or options.features:
+        return options.model
+    return (Path(DEFAULT),)
 
 
 def _files_read(options: ProbeOptions) -> tuple[Path, ...]:
-    records = [
-        run / name
-        for run in options.model
-        for name in ("config.json", "metrics.jsonl", "tokenizer.json")
-    ]
+    """Return the files of the options that no result may be written over."""
+    records = []
+    for run in options.model:
+        records += [run / name for name in ("config.json", "metrics.jsonl", "tokenizer.json")]
     return (*options.data, *options.model, *options.features, *records)

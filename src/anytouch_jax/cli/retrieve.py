@@ -1,5 +1,7 @@
-"""`anytouch retrieve`, cross-sensor retrieval of the same touch, and `anytouch report`, the
-evaluation of two runs.
+"""`anytouch retrieve` and `anytouch report`.
+
+The first is cross-sensor retrieval of the same touch, or a search among stored ones. The second
+evaluates a stage-1 and a stage-2 run.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ from anytouch_jax.cli.output import (
     print_table,
     refuse_unused,
 )
-from anytouch_jax.config import FIELD_SENSORS, UNIVERSAL
+from anytouch_jax.config import FIELD_SENSORS, UNIVERSAL, check_spelling
 from anytouch_jax.config.parsing import Count, Range, Seed
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_write
@@ -29,18 +31,21 @@ from anytouch_jax.files import atomic_write
 if TYPE_CHECKING:
     import numpy as np
 
+    from anytouch_jax.data.background.rule import UnitGels
+    from anytouch_jax.data.manifest.manifest import Manifest
     from anytouch_jax.encoder.encoder import Encoder
+    from anytouch_jax.evaluate.retrieval import Retrieval
 
 
 @dataclass(frozen=True)
 class RetrieveOptions:
-    """Retrieve the same touch felt by another sensor: recall@1 and recall@5 with controls and
-    intervals.
+    """Retrieve the same touch felt by another sensor, or search stored touches.
 
     Example: anytouch retrieve --model runs/stage2 --data data/scenes/manifest.parquet
 
-    A gallery holds the true touch once, and the touches most similar to it in position, depth and
-    force. With --index, list the stored touches nearest to --query instead.
+    You get recall@1 and recall@5 with controls and intervals. A gallery holds the true touch once,
+    and the touches most similar to it in position, depth and force. With --index, list the stored
+    touches nearest to --query instead.
     """
 
     # Manifest with the columns touch and unit, and contact labels (label.x, y, depth, force).
@@ -72,44 +77,35 @@ class RetrieveOptions:
 
 
 def run_retrieve(options: RetrieveOptions) -> int:
-    """Score cross-sensor retrieval, or search an index, print a table, and write JSON with
-    --out.
-    """
+    """Score cross-sensor retrieval, or search an index, and print a table."""
     if options.index is not None:
-        return _search(options)
+        return _search(options, options.index)
     refuse_unused(
         options, ("query", "sensor", "background", "count", "approximate"), "without --index"
     )
     if options.data is None:
         raise UserError("Give a manifest with --data, or features to search in with --index.")
-    import numpy as np
-
-    from anytouch_jax.data.background.rule import UnitGels
-    from anytouch_jax.data.manifest import manifest as manifests
-    from anytouch_jax.encoder import embed as embedding
-    from anytouch_jax.encoder import encoder as features
-    from anytouch_jax.evaluate import retrieval
-    from anytouch_jax.evaluate.feature_cache import background_difference
-    from anytouch_jax.evaluate.report import PIXELS, VECTOR
-    from anytouch_jax.evaluate.statistics import markdown_table, plain
-    from anytouch_jax.train.mesh import enable_compilation_cache
-
     if not options.by_chance:
         refuse_unused(options, ("seeds",), "without --by-chance")
     check_folder(options.out, read=(options.data, *options.model))
+    return _score(options, options.data)
+
+
+def _score(options: RetrieveOptions, data: Path) -> int:
+    """Score retrieval by every encoder and control, print a table, and write JSON with --out."""
+    from anytouch_jax.data.background.rule import UnitGels
+    from anytouch_jax.data.manifest import manifest as manifests
+    from anytouch_jax.encoder import embed as embedding
+    from anytouch_jax.evaluate import retrieval
+    from anytouch_jax.evaluate.report import VECTOR
+    from anytouch_jax.evaluate.tables import markdown_table, plain
+    from anytouch_jax.train.mesh import enable_compilation_cache
+
     enable_compilation_cache()
-    encoders = {
-        str(path): features.load_encoder(path) for path in options.model or (Path(DEFAULT),)
-    }
-    if options.controls:
-        encoders["random encoder"] = features.random_encoder(next(iter(encoders.values())).config)
-    for encoder in encoders.values():
-        features.check_frames(encoder.config.model, options.frames)
-    table = manifests.read(options.data)
-    rows = table.rows_of(options.split)
-    rows = rows[~np.isin(table.text_column("sensor")[rows], FIELD_SENSORS)]
+    table = manifests.read(data)
+    rows = _rows(options, table)
+    encoders = _encoders(options)
     gels = UnitGels(table)
-    rows = retrieval.deepest_rows(table, rows, frames=options.frames)
     for encoder in encoders.values():
         rows = embedding.rows_with_gel(encoder, gels, rows, log)
     settings: dict[str, Any] = {
@@ -120,10 +116,63 @@ def run_retrieve(options: RetrieveOptions) -> int:
     # raises for an impossible gallery, before the work
     retrieval.cross_sensor_retrieval(table, {}, rows, **settings)
     log(gels.report(rows))
-    values: dict[str, Any] = {}
+    values = _features(options, encoders, table, rows, gels)
+    scores = retrieval.cross_sensor_retrieval(
+        table, values, rows, metrics={VECTOR: "euclidean"}, **settings
+    )
+    print_table(markdown_table(_COLUMNS, [_cells(score) for score in scores]))
+    for note in dict.fromkeys(note for score in scores for note in score.notes):
+        log(note)
+    if options.out is not None:
+        about = {"data": table.content_hash, "split": options.split, "frames": options.frames}
+        atomic_write(options.out, json.dumps(about | {"results": plain(scores)}, indent=2) + "\n")
+    log_default(options.model)
+    return 0
+
+
+def _encoders(options: RetrieveOptions) -> dict[str, Encoder]:
+    """Return the encoders by name, and an untrained one as a control."""
+    from anytouch_jax.encoder import encoder as loading
+
+    models = options.model or (Path(DEFAULT),)
+    encoders = {str(path): loading.load_encoder(path) for path in models}
+    if options.controls:
+        first = next(iter(encoders.values()))
+        encoders["random encoder"] = loading.random_encoder(first.config)
+    for encoder in encoders.values():
+        loading.check_frames(encoder.config.model, options.frames)
+    return encoders
+
+
+def _rows(options: RetrieveOptions, table: Manifest) -> np.ndarray:
+    """Return the deepest rows of the split, of sensors with images."""
+    import numpy as np
+
+    from anytouch_jax.evaluate import retrieval
+
+    rows = table.rows_of(options.split)
+    rows = rows[~np.isin(table.text_column("sensor")[rows], FIELD_SENSORS)]
+    return retrieval.deepest_rows(table, rows, frames=options.frames)
+
+
+def _features(
+    options: RetrieveOptions,
+    encoders: Mapping[str, Encoder],
+    table: Manifest,
+    rows: np.ndarray,
+    gels: UnitGels,
+) -> dict[str, np.ndarray]:
+    """Return the features of the rows by every encoder, and by the controls without one."""
+    from anytouch_jax.encoder.embed import embed_rows
+    from anytouch_jax.evaluate import retrieval
+    from anytouch_jax.evaluate.feature_cache import background_difference
+    from anytouch_jax.evaluate.report import PIXELS, VECTOR
+
+    values = {}
     for name, encoder in encoders.items():
-        how = (options.frames, options.pooling)
-        kept, values[name] = embedding.embed_rows(encoder, table, rows, *how, gels=gels, log=log)
+        kept, values[name] = embed_rows(
+            encoder, table, rows, options.frames, options.pooling, gels=gels, log=log
+        )
         if len(kept) < len(rows):
             raise UserError(
                 f"{len(rows) - len(kept)} of {len(rows)} rows cannot be read. Repair the manifest "
@@ -136,61 +185,42 @@ def run_retrieve(options: RetrieveOptions) -> int:
                 values[name] = make(table, rows)
             except UserError as error:
                 log(f"no control by {name}: {error}")
-    scores = retrieval.cross_sensor_retrieval(
-        table, values, rows, metrics={VECTOR: "euclidean"}, **settings
-    )
-    head = (
-        "features",
-        "query",
-        "gallery",
-        "centred",
-        "recall@1",
-        "95 %",
-        "recall@5",
-        "chance",
-        "of",
-        "queries",
-    )
-    print_table(markdown_table(head, [_cells(score) for score in scores]))
-    for note in dict.fromkeys(note for score in scores for note in score.notes):
-        log(note)
-    if options.out is not None:
-        about = {"data": table.content_hash, "split": options.split, "frames": options.frames}
-        atomic_write(options.out, json.dumps(about | {"results": plain(scores)}, indent=2) + "\n")
-    log_default(options.model)
-    return 0
+    return values
 
 
-def _search(options: RetrieveOptions) -> int:
+def _search(options: RetrieveOptions, index_file: Path) -> int:
     """List the stored touches nearest to a query."""
     from anytouch_jax.encoder.embed import load_index
     from anytouch_jax.encoder.encoder import load_encoder
     from anytouch_jax.errors import shorten
-    from anytouch_jax.evaluate.statistics import markdown_table
+    from anytouch_jax.evaluate.tables import markdown_table
     from anytouch_jax.train.mesh import enable_compilation_cache
 
     others = ("data", "split", "frames", "pooling", "gallery", "by_chance", "seeds", "controls")
     refuse_unused(options, others, "with --index, whose features are searched")
-    if options.query is None or options.index is None:
+    if options.query is None:
         raise UserError(
             "Give what to look for with --query: a picture, a folder, a video or a sentence."
         )
     if len(options.model) > 1:
         raise UserError(f"A search takes one encoder, not {len(options.model)}. Give one --model.")
-    check_folder(options.out, read=(options.index, *options.model))
-    index = load_index(options.index, approximate=options.approximate)
+    if options.sensor is not None:
+        check_spelling(options.sensor)  # before the encoder is loaded, which takes seconds
+    check_folder(options.out, read=(index_file, *options.model))
+    index = load_index(index_file, approximate=options.approximate)
     enable_compilation_cache()
-    encoder = load_encoder((options.model or (Path(DEFAULT),))[0])
+    model = options.model[0] if options.model else Path(DEFAULT)
+    encoder = load_encoder(model)
     index.check(encoder.source, encoder.fingerprint)
-    ids, cosines = index.search(_query(options, encoder, index.about, index.gels), options.count)
-    hits = [
-        {"cosine": f"{cosine:.3f}"} | index.describe(row)
-        for row, cosine in zip(ids[0], cosines[0], strict=True)
-    ]
+    query = _query(options, options.query, encoder, index.about, index.gels)
+    ids, cosines = index.search(query, options.count)
+    hits = []
+    for row, cosine in zip(ids[0], cosines[0], strict=True):
+        hits.append({"cosine": f"{cosine:.3f}"} | index.describe(row))
     head = list(hits[0])
     print_table(markdown_table(head, [[shorten(hit[name]) for name in head] for hit in hits]))
     if options.out is not None:
-        about = {"index": str(options.index), "query": options.query}
+        about = {"index": str(index_file), "query": options.query}
         atomic_write(options.out, json.dumps(about | {"hits": hits}, indent=2) + "\n")
     log_default(options.model)
     return 0
@@ -198,22 +228,27 @@ def _search(options: RetrieveOptions) -> int:
 
 def _query(
     options: RetrieveOptions,
+    query: str,
     encoder: Encoder,
     about: dict[str, str],
     known: Mapping[str, np.ndarray],
 ) -> np.ndarray:
-    """Return features (1, d) of a picture, of the last clip of a folder or video, or of a
-    sentence.
+    """Return features (1, d) of what is looked for.
+
+    Args:
+        options: of the command.
+        query: a picture, a folder or video, of which the last clip counts, or a sentence.
+        encoder: that the index was made by.
+        about: how the features of the index were made.
+        known: backgrounds by sensor instance, of the index.
     """
     import numpy as np
 
     from anytouch_jax.cli.embed import choose_gel
-    from anytouch_jax.data import images
     from anytouch_jax.encoder.base import Preprocess
 
-    path = Path(str(options.query))
-    pooling = about.get("pooling", "class")
-    length = int(about.get("frames", "1")) if about.get("frames", "1").isdecimal() else 1
+    path = Path(query)
+    pooling: Any = about.get("pooling", "class")
     if not path.exists():
         refuse_unused(
             options,
@@ -225,44 +260,77 @@ def _query(
                 f"A sentence is compared with features of pooling class, not {pooling}. Embed "
                 "again."
             )
-        return encoder.encode_text(str(options.query))
-    if (files := images.picture_files(path)) is None:
+        return encoder.encode_text(query)
+    length = 1
+    if about.get("frames", "1").isdecimal():
+        length = int(about.get("frames", "1"))
+    frames = _last_frames(path, length)
+    gel, _ = choose_gel(encoder, options.background, path, known, "the index was made with")
+    preprocess = Preprocess(encoder, gel)
+    clip = np.stack([preprocess(frame) for frame in frames])[None]
+    join: Any = about.get("join", "mean")
+    return encoder.encode_touch(clip, options.sensor or UNIVERSAL, pooling=pooling, join=join)
+
+
+def _last_frames(path: Path, length: int) -> list[np.ndarray]:
+    """Return the last frames of a folder or video, or a picture as often as a clip is long."""
+    from anytouch_jax.data import images
+
+    files = images.picture_files(path)
+    if files is None:
         frames = list(images.frames_from_video(path))[-length:]
     else:
-        frames = [
-            images.decode(file) for file in (files if path.is_dir() else files * length)[-length:]
-        ]
+        if not path.is_dir():
+            files = files * length  # a still is a clip of equal frames
+        frames = [images.decode(file) for file in files[-length:]]
     if len(frames) < length:
         raise UserError(
             f"{path} has {len(frames)} frames, and the index holds clips of {length}. Give more "
             "frames."
         )
-    preprocess = Preprocess(encoder, choose_gel(encoder, options.background, path, known)[0])
-    clip = np.stack([preprocess(frame) for frame in frames])[None]
-    join: Any = about.get("join", "mean")
-    return encoder.encode_touch(clip, options.sensor or UNIVERSAL, pooling=pooling, join=join)  # type: ignore[arg-type]
+    return frames
 
 
-def _cells(score: Any) -> tuple[str, ...]:
-    interval = "-" if score.low is None else f"{100 * score.low:.1f} to {100 * score.high:.1f}"
-    shares = (
-        f"{100 * score.top1:.1f} %",
-        interval,
-        f"{100 * score.top5:.1f} %",
-        f"{100 * score.chance1:.1f} %",
+_COLUMNS = (
+    "features",
+    "query",
+    "gallery",
+    "centred",
+    "recall@1",
+    "95 %",
+    "recall@5",
+    "chance",
+    "of",
+    "queries",
+)
+
+
+def _cells(score: Retrieval) -> tuple[str, ...]:
+    """Return the cells of _COLUMNS."""
+    from anytouch_jax.evaluate.tables import interval_text, share_text
+
+    return (
+        score.name,
+        score.query_sensor,
+        score.gallery_sensor,
+        "yes" if score.centred else "no",
+        share_text(score.top1),
+        interval_text(score.low, score.high),
+        share_text(score.top5),
+        share_text(score.chance1),
+        str(score.gallery),
+        str(score.queries),
     )
-    centred = "yes" if score.centred else "no"
-    sizes = (str(score.gallery), str(score.queries))
-    return (score.name, score.query_sensor, score.gallery_sensor, centred, *shares, *sizes)
 
 
 @dataclass(frozen=True)
 class ReportOptions:
-    """Report on a stage-1 and a stage-2 run: samples, losses, reconstructions, t-SNE, retrieval and
-    probes.
+    """Report on a stage-1 and a stage-2 run: samples, losses, retrieval, probes.
 
     Example: anytouch report --data data/scenes/manifest.parquet --stage1 runs/stage1 --stage2
     runs/stage2 --out report
+
+    The report has reconstructions and a t-SNE, too.
     """
 
     data: Path  # Manifest of simulated scenes, or one with the same columns.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -15,7 +16,7 @@ from anytouch_jax.config.parsing import Above0, Count, NotNegative, Seed
 from anytouch_jax.errors import UserError
 
 if TYPE_CHECKING:
-    from anytouch_jax.sim.fitting.tokens import Comparison
+    from anytouch_jax.sim.fitting.comparison import Comparison
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,9 +167,10 @@ def _check_adapt(options: AdaptOptions, simulated: bool) -> None:
 def _simulated(options: AdaptOptions) -> int:
     """Train the tokens of a sensor of `anytouch sensor fit`."""
     from anytouch_jax.encoder.adapt import save
-    from anytouch_jax.sim.fitting.tokens import Comparison, adapt_by_simulation
+    from anytouch_jax.sim.fitting.comparison import Comparison
+    from anytouch_jax.sim.fitting.tokens import adapt_by_simulation
 
-    state = options.out.with_name(f"{options.out.name}.part.npz")
+    state = options.out.with_name(f"{options.out.name}.part")
     log("compiling the simulator: about two minutes at first")
     adapted = adapt_by_simulation(
         options.model,
@@ -183,7 +185,7 @@ def _simulated(options: AdaptOptions) -> int:
         log(f"interrupted: {state} keeps the state. Run the same command again to continue.")
         return 130
     save(adapted, options.model, options.out)
-    state.unlink(missing_ok=True)
+    shutil.rmtree(state, ignore_errors=True)
     source = adapted.metadata["source"]
     name = source["sensor"]
     compared = Comparison(**source["compared"])

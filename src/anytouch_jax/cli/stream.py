@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import time
 from dataclasses import dataclass, fields
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional
 
-from anytouch_jax.cli import embed
+from anytouch_jax.cli import embed, inputs
 from anytouch_jax.cli.arguments import DEFAULT
 from anytouch_jax.cli.output import check_folder, log, refuse_unused
 from anytouch_jax.config import UNIVERSAL
@@ -18,11 +19,13 @@ from anytouch_jax.config.parsing import Above0, Count, NotNegative, Range
 from anytouch_jax.errors import UserError
 
 if TYPE_CHECKING:
+    from anytouch_jax.encoder.encoder import Encoder
     from anytouch_jax.encoder.linear_head import LinearHead
+    from anytouch_jax.encoder.measured import Measure
     from anytouch_jax.live.cameras import CameraSettings
     from anytouch_jax.live.page.live import Live
     from anytouch_jax.live.page.server import Source
-    from anytouch_jax.live.stream import Embedded
+    from anytouch_jax.live.stream import Embedded, Result
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +50,7 @@ class CameraOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class StreamOptions(CameraOptions, embed.FrameOptions):
+class StreamOptions(CameraOptions, inputs.FrameOptions):
     """Embed a camera or a video frame by frame, and report the latency of each part.
 
     Example: anytouch stream --data 0 --sensor digit --out -
@@ -78,101 +81,172 @@ class StreamOptions(CameraOptions, embed.FrameOptions):
 
 def run_stream(options: StreamOptions) -> int:
     """Embed frame by frame, write features or JSON lines, then print the latency."""
-    lines = str(options.out) == "-"
+    prints_lines = str(options.out) == "-"
     settings = options.settings()
-    data = Path(options.data)
-    if not lines:
-        check_folder(options.out, read=(options.model, data), suffix=".npz")
-    if options.frames == 1:
-        refuse_unused(options, ("stride",), "on single frames. Ask for clips with --frames, or")
-    if not options.fields:
-        refuse_unused(options, ("width_mm",), "without --fields")
-    from anytouch_jax.data.images import decode
-    from anytouch_jax.encoder.embed import Features
+    _check_stream(options)
     from anytouch_jax.live import stream
+    from anytouch_jax.live.freshness import nominal_rate
 
-    # first: it fails within a second
+    # The source is opened first, because it fails within a second.
     source, live = stream.open_source(options.data, settings, log)
+    nominal = nominal_rate(source)  # a source that is released has none
     if not live:
         refuse_unused(options, [field.name for field in fields(CameraOptions)], "with a film")
-    encoder, pooling, head = embed.load_inputs(options)
-    measure = None
-    if options.fields:
-        gel = None if options.background is None else decode(options.background)
-        turned: dict[str, Any] = {"rotate": options.rotate, "flip": options.flip}
-        measure = encoder.measure_of(
-            options.sensor or UNIVERSAL, gel, options.width_mm, log, **turned
-        )
-    known = encoder.gels if head is None else head.gels
-    row, preprocess, gate, about = embed.frames_input(encoder, options, data, known)
-    embedded = stream.stream(
-        encoder,
+    given = inputs.load_inputs(options)
+    measure = _measure_of(given.encoder, options) if options.fields else None
+    known = inputs.frames_input(given.encoder, options, Path(options.data), given.known_gels)
+    embedded = stream.stream_with(
+        given.encoder,
         source,
-        preprocess,
-        live=live,
-        sensor=row,
-        frames=options.frames,
-        stride=options.stride,
-        pooling=pooling,
-        join=options.join,
-        log=log,
-        contact=gate,
-        reuse=options.reuse,
-        measure=measure,
+        stream.StreamSettings(
+            live=live,
+            sensor=known.row,
+            frames=options.frames,
+            stride=options.stride,
+            pooling=given.pooling,
+            join=options.join,
+            preprocess=known.preprocess,
+            contact=known.gate,
+            reuse=options.reuse,
+            measure=measure,
+            log=log,
+        ),
     )
-    result = stream.collect(
-        embedded, (lambda frame: _print_line(frame, live, head)) if lines else None
-    )
+    on_each = None
+    if prints_lines:
+        on_each = partial(_print_line, live=live, head=given.head)
+    result = stream.collect(embedded, on_each)
     if result.error is not None and not result.total:
         raise result.error
     if not live and not result.interrupted:
-        if not len(result.numbers):
-            raise UserError(
-                f"{data} has too few frames for a clip of {options.frames} at stride "
-                f"{options.stride}. "
-                "Lower one of them."
-            )
-        embed.log_if_cut(data, int(result.numbers[-1]) + 1)
-    if not lines:
-        about |= {"stride": str(options.stride), "pooling": pooling, "input": options.data}
-        if live and len(result.numbers):
-            about |= {"started": f"{result.started:.6f}"}
-            about |= {name: str(getattr(result, name)) for name in ("missed", "frozen", "black")}
-        features = Features(
-            result.values, result.numbers, {"frame_index": result.numbers, "time": result.time}
-        )
-        features.keys.update(reused=result.reused, estimated=result.estimated)
-        features.gels.update(embed.gels_of(preprocess, options))
-        features.predictions.update(result.fields or {})
-        features.predictions["contact"] = result.contact
-        embed.save_features(options.out, encoder, features, head, options, about)
-    embed.log_universal(encoder, options)
+        _check_film(options, result)
+    if not prints_lines:
+        _save_stream(options, given, known, result, live=live)
+    inputs.log_universal(given.encoder, options)
     for line in stream.budget(result):
         log(line)
-    if not lines:
+    if live:
+        _log_rate(result, nominal)
+    if not prints_lines:
         print(f"{options.out}: {len(result.values)} features of {result.values.shape[1]} values")
     if result.error is not None:
         raise result.error
     return 0
 
 
+def _check_stream(options: StreamOptions) -> None:
+    """Raise UserError for options that do not go together, and for an output that cannot be."""
+    if str(options.out) != "-":
+        check_folder(options.out, read=(options.model, Path(options.data)), suffix=".npz")
+    if options.frames == 1:
+        refuse_unused(options, ("stride",), "on single frames. Ask for clips with --frames, or")
+    if not options.fields:
+        refuse_unused(options, ("width_mm",), "without --fields")
+
+
+def _measure_of(encoder: Encoder, options: StreamOptions) -> Measure:
+    """Return what measures the frames that the options name."""
+    from anytouch_jax.data.images import decode
+
+    gel = None if options.background is None else decode(options.background)
+    return encoder.measure_of(
+        options.sensor or UNIVERSAL,
+        gel,
+        options.width_mm,
+        log,
+        rotate=options.rotate,
+        flip=options.flip,
+    )
+
+
+def _check_film(options: StreamOptions, result: Result) -> None:
+    """Log a film that is shorter than its header says.
+
+    Raises UserError for one without a clip.
+    """
+    if not len(result.numbers):
+        raise UserError(
+            f"{options.data} has too few frames for a clip of {options.frames} at stride "
+            f"{options.stride}. Lower one of them."
+        )
+    inputs.log_if_cut(Path(options.data), int(result.numbers[-1]) + 1)
+
+
+def _log_rate(result: Result, nominal: float) -> None:
+    """Log how many fresh frames a second a camera gave, and a warning if they are too few."""
+    rate = result.rate(nominal)
+    if rate is None:
+        return
+    log(f"camera: {rate}")
+    if rate.warning():
+        log(rate.warning())
+
+
+def _save_stream(
+    options: StreamOptions,
+    given: inputs.Inputs,
+    known: inputs.FramesInput,
+    result: Result,
+    *,
+    live: bool,
+) -> None:
+    """Write the features, with what was measured and predicted of their frames."""
+    from anytouch_jax.encoder.embed import Features
+
+    about = known.about
+    about |= {"stride": str(options.stride), "pooling": given.pooling, "input": options.data}
+    if live and len(result.numbers):
+        about |= {
+            "started": f"{result.started:.6f}",
+            "missed": str(result.missed),
+            "frozen": str(result.frozen),
+            "black": str(result.black),
+        }
+    keys = {
+        "frame_index": result.numbers,
+        "time": result.time,
+        "reused": result.reused,
+        "estimated": result.estimated,
+    }
+    features = Features(result.values, result.numbers, keys)
+    features.gels.update(inputs.gels_of(known.preprocess, options))
+    features.predictions.update(result.fields or {})
+    features.predictions["contact"] = result.contact
+    embed.save_features(options.out, given.encoder, features, given.head, options, about)
+
+
 def _print_line(frame: Embedded, live: bool, head: LinearHead | None) -> None:
-    # the shortest digits of the same float32
-    values = [float(str(value)) for value in frame.values]
+    """Print a frame as a line of JSON."""
     line: dict[str, Any] = {"frame": frame.number, "time": round(frame.time, 6)}
     if live:
         line |= {"picture": frame.picture, "missed": frame.missed}
-    line |= {"reused": frame.reused} | ({"background": "estimated"} if frame.estimated else {})
-    if head is not None and head.calibration is not None:
-        one = head.assess(frame.values[None])
-        line |= {"label": str(one.label[0]), "p": round(float(one.p.max()), 6)}
-        line |= {"set": head.classes[one.in_set[0]].tolist(), "novel": bool(one.novel[0])}
-    elif head is not None:
-        (label,), p = head(frame.values[None])
-        line |= {"label": str(label), "p": round(float(p.max()), 6)}
-    line |= {"contact": None if frame.contact != frame.contact else bool(frame.contact)}
-    measured = {} if frame.fields is None else {"fields": frame.fields.summary()}
-    print(json.dumps(line | measured | {"features": values}), flush=True)
+    line["reused"] = frame.reused
+    if frame.estimated:
+        line["background"] = "estimated"
+    if head is not None:
+        line |= _predicted(head, frame)
+    is_known = frame.contact == frame.contact  # NaN is unknown
+    line["contact"] = bool(frame.contact) if is_known else None
+    if frame.fields is not None:
+        line["fields"] = frame.fields.summary()
+    # The shortest digits that are read back as the same float32.
+    line["features"] = [float(str(value)) for value in frame.values]
+    print(json.dumps(line), flush=True)
+
+
+def _predicted(head: LinearHead, frame: Embedded) -> dict[str, Any]:
+    """Return the class of a frame, and what the calibration of the head says of it."""
+    features = frame.values[None]
+    if head.calibration is None:
+        (label,), p = head(features)
+        return {"label": str(label), "p": round(float(p.max()), 6)}
+    one = head.assess(features)
+    return {
+        "label": str(one.label[0]),
+        "p": round(float(one.p.max()), 6),
+        "set": head.classes[one.in_set[0]].tolist(),
+        "novel": bool(one.novel[0]),
+    }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -215,13 +289,9 @@ def run_view(options: ViewOptions) -> int:
         ) from None
     from anytouch_jax.live.cameras import camera_of
 
-    tables = (".csv", ".parquet", ".npz")
-    played = [
-        one
-        for one in options.paths
-        if Path(one).is_file() and Path(one).suffix.lower() not in tables
-    ]
-    played = played if options.live else []
+    played = list[str]()
+    if options.live:
+        played = [path for path in options.paths if _is_film(Path(path))]
     cameras = [path for path in options.paths if path in played or camera_of(path) is not None]
     if not cameras and options.paths:
         refuse_unused(
@@ -235,9 +305,8 @@ def run_view(options: ViewOptions) -> int:
             "next."
         )
     begin = time.perf_counter()
-    sources = server.open_sources(
-        [Path(path) for path in options.paths or ("examples",) if path not in cameras]
-    )
+    named = options.paths or ("examples",)
+    sources = server.open_sources([Path(path) for path in named if path not in cameras])
     if not options.paths:
         sources.insert(0, server.StartPage(lambda camera: _open_camera(options, camera, sources)))
     for camera in cameras:
@@ -252,9 +321,16 @@ def run_view(options: ViewOptions) -> int:
     return 0
 
 
+def _is_film(path: Path) -> bool:
+    """Return whether a path is a file that --live can play: not a table, not features."""
+    return path.is_file() and path.suffix.lower() not in (".csv", ".parquet", ".npz")
+
+
 def _open_camera(options: ViewOptions, camera: str, sources: list[Source]) -> Live:
+    """Return the live page of a camera, or of a film in its place."""
     from anytouch_jax.encoder.encoder import load_encoder
     from anytouch_jax.encoder.linear_head import load_head
+    from anytouch_jax.live.examples import EXAMPLE, SENSOR
     from anytouch_jax.live.page.live import Live
     from anytouch_jax.train.mesh import enable_compilation_cache
 
@@ -265,14 +341,21 @@ def _open_camera(options: ViewOptions, camera: str, sources: list[Source]) -> Li
     head = None if options.head is None else load_head(options.head)
     if head is not None:
         head.check(encoder.source, encoder.fingerprint, head.pooling, 1)
+    # Live touch is compared with the first features that are shown.
     spaces: list[Any] = [source for source in sources if source.kind == "space"]
+    sensor = options.sensor
+    out = options.out
+    if camera == EXAMPLE:
+        sensor = SENSOR
+        # What it teaches is not mixed with recordings of the user's own sensor.
+        out = out.with_name(f"{out.name}_examples")
     return Live(
         camera,
         encoder,
-        sensor=options.sensor,
+        sensor=sensor,
         head=head,
         space=spaces[0] if spaces else None,
-        out=options.out,
+        out=out,
         camera=options.settings(),
         log=log,
     )

@@ -5,10 +5,12 @@ from __future__ import annotations
 import signal
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from difflib import get_close_matches
 from operator import attrgetter
 from pathlib import Path
 from typing import Literal, NamedTuple, get_type_hints
 
+from anytouch_jax import doors
 from anytouch_jax.cli.arguments import is_option, options_of, parse_options, spelled
 from anytouch_jax.cli.output import log
 from anytouch_jax.config import (
@@ -43,7 +45,12 @@ _STAGE_2_FIELDS = (
     "model.temperature",
     "data.negatives",
 )
-_RECONSTRUCTION_FIELDS = ("objective.mask_ratio", "objective.norm_pix_loss", "objective.next_frame")
+_RECONSTRUCTION_FIELDS = (
+    "objective.mask_ratio",
+    "objective.norm_pix_loss",
+    "objective.next_frame",
+    "objective.next_frame_residual",
+)
 
 
 @dataclass(frozen=True)
@@ -87,8 +94,9 @@ class TrainOptions:
 
 @dataclass(frozen=True)
 class Sections:
-    """Every field of the configuration, with the defaults of the preset, the recipe and the options
-    of --help.
+    """Every field of the configuration.
+
+    The defaults are those of the preset, the recipe and the options of --help.
     """
 
     model: ModelConfig  # Network: its sizes, its parts, the table of sensors.
@@ -109,16 +117,12 @@ class TrainRequest(NamedTuple):
 def parse(kind: type[TrainOptions], name: str, args: Sequence[str]) -> TrainRequest:
     """Return the options of `train` and its configuration.
 
-    Sections are second: the preset has their defaults.
+    The sections come second, because their defaults are those of the preset.
     """
     list_all = "--help-all" in args
     plain, sections = _split_sections([arg for arg in args if arg != "--help-all"])
     defaults = TrainOptions((), Path("runs/stage1")) if list_all else None
-    names = [option.name for option in options_of(Sections)]
-    others = {f"--{name.rpartition('.')[2]}": name for name in reversed(names)} | {
-        name: name for name in names
-    }
-    options = parse_options(kind, name, plain, defaults, others=others)
+    options = parse_options(kind, name, plain, defaults, others=_section_names())
     config = _configure(options)
     if not sections and not list_all:
         return TrainRequest(options, config)
@@ -132,36 +136,53 @@ def parse(kind: type[TrainOptions], name: str, args: Sequence[str]) -> TrainRequ
     return TrainRequest(options, replace(config, **vars(section)))
 
 
-def run(request: TrainRequest) -> int:
-    """Train or continue, alone or as one of several processes; 0 after SIGTERM and 130 after
-    Ctrl-C, both saved.
+def _section_names() -> dict[str, str]:
+    """Return every option of a section by its name, and by its last word for who forgot the rest.
+
+    Where two sections have the same last word, the first one answers to it.
     """
+    names = [option.name for option in options_of(Sections)]
+    short = {f"--{name.rpartition('.')[2]}": name for name in reversed(names)}
+    return short | {name: name for name in names}
+
+
+def run(request: TrainRequest) -> int:
+    """Train or continue, alone or as one of several processes.
+
+    Returns 0 after SIGTERM and 130 after Ctrl-C, both saved.
+    """
+    options = request.options
+    config = _with_own_sensors(request.config)
+    # Wrong words are refused before jax and the networks are imported, which takes seconds.
+    _refuse_unread(options, config)
+    _refuse_unknown(options, config)
+    try:
+        return _train(options, config)
+    except Terminated:
+        log(_before_first_step(options.run, "SIGTERM"))
+        return 0
+    except KeyboardInterrupt:
+        log(_before_first_step(options.run, "Ctrl-C"))
+        return 130
+
+
+def _train(options: TrainOptions, config: Config) -> int:
     from anytouch_jax.train.mesh import enable_compilation_cache, joined
     from anytouch_jax.train.progress import terminating
     from anytouch_jax.training import pretrain
 
-    options = request[0]
-    config = _with_own_sensors(request[1])
-    _refuse_unread(options, config)
-    try:
-        with terminating():
-            enable_compilation_cache()
-            with joined() as place:
-                result = pretrain(
-                    config,
-                    options.run,
-                    init=options.init,
-                    clip=options.clip_weights,
-                    stop_after=options.stop_after,
-                    log=log,
-                    curve=options.curve,
-                )
-    except Terminated:
-        log(
-            f"stopped by SIGTERM before the first step of {options.run}. Run the same command "
-            "again to continue."
-        )
-        return 0
+    with terminating():
+        enable_compilation_cache()
+        with joined() as place:
+            result = pretrain(
+                config,
+                options.run,
+                init=options.init,
+                clip=options.clip_weights,
+                stop_after=options.stop_after,
+                log=log,
+                curve=options.curve,
+            )
     if result.interrupted == signal.SIGINT:
         return 130
     if place is None or place.index == 0:
@@ -169,25 +190,39 @@ def run(request: TrainRequest) -> int:
     return 0
 
 
+def _before_first_step(run: Path, word: str) -> str:
+    """Return what a run that was stopped while it started tells: nothing new, nothing lost."""
+    return (
+        f"stopped by {word} before the first step of {run}. Nothing new was saved, and earlier "
+        "checkpoints are kept. Run the same command again to continue."
+    )
+
+
 def _with_own_sensors(config: Config) -> Config:
-    """Return the configuration with tokens for the sensors of `anytouch sensor fit` among the
-    simulated ones.
+    """Return the configuration with tokens for the own sensors among the simulated ones.
+
+    They are folders NAME.sensor of `anytouch sensor fit`.
     """
     folders = [word for word in config.simulated.sensors if word.endswith(OWN_SENSOR)]
     if not folders:
         return config
     from anytouch_jax.sim.sensing.own import read_numbers
 
-    names = dict.fromkeys(
-        (*config.model.sensors, *(read_numbers(folder).name for folder in folders))
-    )
+    own = [read_numbers(folder).name for folder in folders]
+    names = dict.fromkeys((*config.model.sensors, *own))
     return replace(config, model=replace(config.model, sensors=tuple(names)))
 
 
 def _configure(options: TrainOptions, *, usual: bool = False) -> Config:
-    """Return the configuration of the preset and recipe, changed by the short options (unless
-    `usual`) and baseline.
+    """Return the configuration of the preset, the recipe, the short options and the baseline.
+
+    With `usual` the short options are left out.
     """
+    config = preset(
+        options.preset, stage=options.stage, recipe=options.recipe, towers=options.towers
+    )
+    if usual:
+        return presets.apply_baseline(options.baseline, config)
     short = {
         "data.manifests": tuple(map(str, options.data)),
         "data.on_bad_sample": options.on_bad_sample,
@@ -197,23 +232,12 @@ def _configure(options: TrainOptions, *, usual: bool = False) -> Config:
         "run.save_every": options.save_every,
         "run.tensorboard": options.tensorboard,
     }
-    config = preset(
-        options.preset, stage=options.stage, recipe=options.recipe, towers=options.towers
-    )
-    if usual:
-        return presets.apply_baseline(options.baseline, config)
-    config = config.with_settings(
-        {name: value for name, value in short.items() if value is not None}
-    )
-    return presets.apply_baseline(options.baseline, config)
+    given = {name: value for name, value in short.items() if value is not None}
+    return presets.apply_baseline(options.baseline, config.with_settings(given))
 
 
 def _refuse_unread(options: TrainOptions, config: Config) -> None:
-    """Raise UserError for options that do not go together, and for settings that this stage does
-    not read.
-    """
-    for name in config.model.sensors:
-        check_spelling(name)
+    """Raise UserError for options that do not go together, or that this stage does not read."""
     baseline = presets.find_baseline(options.baseline)
     if options.stage == 2 and options.init and not baseline.starts_from_stage1:
         raise UserError(f"baseline {baseline.name} has no stage 1. Remove --init.")
@@ -225,28 +249,88 @@ def _refuse_unread(options: TrainOptions, config: Config) -> None:
         raise UserError(
             "--clip-weights needs --towers pretrained in stage 2. Add it, or remove --clip-weights."
         )
-    unread = dict.fromkeys(_STAGE_2_FIELDS, "in stage 1")
-    if options.stage == 2:
-        reads = () if config.reconstructs else _RECONSTRUCTION_FIELDS
-        unread = dict.fromkeys(reads, "in stage 2 of the paper recipe")
-        if options.clip_weights:
-            unread["model.temperature"] = "with --clip-weights, which has its own"
     usual = _configure(options, usual=True)
-    for field, reason in unread.items():
+    for field, reason in _unread_fields(options, config).items():
         value = attrgetter(field)
         if value(config) != value(usual):
             raise UserError(f"{spelled(field)} has no effect {reason}. Remove it.")
 
 
+def _unread_fields(options: TrainOptions, config: Config) -> dict[str, str]:
+    """Return the fields that a run does not read, and why."""
+    if options.stage == 1:
+        return dict.fromkeys(_STAGE_2_FIELDS, "in stage 1")
+    unread: dict[str, str] = {}
+    if not config.reconstructs:
+        unread |= dict.fromkeys(_RECONSTRUCTION_FIELDS, "in stage 2 of the paper recipe")
+    if options.clip_weights:
+        unread["model.temperature"] = "with --clip-weights, which has its own"
+    return unread
+
+
+def _refuse_unknown(options: TrainOptions, config: Config) -> None:
+    """Raise UserError for words that are no sensor, no split, no objective and no file.
+
+    What only a look into the data can tell, such as a data set's name, is left to that.
+    """
+    from anytouch_jax.data.manifest.schema import SPLITS
+    from anytouch_jax.weights.registry import list_encoders
+
+    for name in config.model.sensors:
+        check_spelling(name)
+    for name in config.simulated.sensors:
+        if not name.endswith(OWN_SENSOR):
+            check_spelling(name, config.model.sensors)
+    if config.data.split not in SPLITS:
+        raise UserError(
+            f"--data.split {config.data.split} is no split. Choose one of {', '.join(SPLITS)}."
+        )
+    for name, _ in config.objective.terms:
+        if name not in doors.OBJECTIVES:
+            raise UserError(
+                f"--objective.terms names {name!r}, which is no objective. Choose one of "
+                f"{', '.join(doors.OBJECTIVES)}."
+            )
+    for name in config.data.manifests:
+        if name in doors.BATCHES or Path(name).expanduser().exists():
+            continue
+        if near := get_close_matches(name, doors.BATCHES, 1):
+            raise UserError(f"there is no manifest {name}. Did you mean --data {near[0]}?")
+        raise UserError(
+            f"there is no manifest {name}. Name a .csv or .parquet file with --data, or "
+            f"{' or '.join(doors.BATCHES)}."
+        )
+    continues = (options.run / "checkpoints").exists()
+    for option, path in (("--init", options.init), ("--clip-weights", options.clip_weights)):
+        # A run that continues does not read them.
+        if path is not None and not continues and not _may_exist(path):
+            names = ", ".join(list_encoders())
+            raise UserError(
+                f"{option} {path} does not exist; give the path of a run folder or a weights file, "
+                f"or one of {names}"
+            )
+
+
+def _may_exist(weights: Path) -> bool:
+    """Return whether weights are a file, or a name or an address that is read later."""
+    from anytouch_jax.weights.registry import FORMER, list_encoders
+
+    # a Path makes hf:/ of hf://
+    named = str(weights) in (*list_encoders(), FORMER) or str(weights).startswith("hf:")
+    return named or weights.expanduser().exists()
+
+
 def _split_sections(args: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Split argv into plain options and those of a section (--model.patch 16), each with the values
-    that follow it.
+    """Split argv into plain options and those of a section, such as --model.patch 16.
+
+    Values stay with the option before them.
     """
     plain: list[str] = []
     section: list[str] = []
     target = plain
     for arg in args:
         if is_option(arg):
-            target = section if "." in arg.partition("=")[0] else plain
+            has_section = "." in arg.partition("=")[0]
+            target = section if has_section else plain
         target.append(arg)
     return plain, section

@@ -22,9 +22,7 @@ FIELD_SENSORS = tuple(name for name, record in RECORDS.items() if record.measure
 OWN_SENSOR = ".sensor"  # ending of a folder of `anytouch sensor fit`
 # sensors without tokens whose names are nearly those of others
 OTHER_SENSORS = tuple(
-    name
-    for name, record in RECORDS.items()
-    if record.measures == "image" and not record.has_tokens
+    name for name, record in RECORDS.items() if record.measures == "image" and not record.has_tokens
 )
 _LETTERS = 2  # by which a misspelt name differs from the right one
 
@@ -34,11 +32,11 @@ class SpellingError(ConfigError):
 
 
 def check_spelling(name: str, known: Iterable[str] = ()) -> None:
-    """Raise SpellingError for a name within two letters of a known one; case, - and blanks do not
-    count as letters.
+    """Raise SpellingError for a name within two letters of a known one.
 
-    Known are SENSORS, FIELD_SENSORS and `known`. A name with more digits, such as digit_2, is a new
-    one. So are OTHER_SENSORS.
+    Without this a misspelt sensor gets tokens of its own and trains them on what belongs to
+    another. Case, - and blanks do not count as letters. Known are SENSORS, FIELD_SENSORS and
+    `known`. A name with more digits, such as digit_2, is a new one. So are OTHER_SENSORS.
     """
 
     def plain(sensor: str) -> str:
@@ -51,15 +49,14 @@ def check_spelling(name: str, known: Iterable[str] = ()) -> None:
     word = plain(name)
     if name in names or word in OTHER_SENSORS:
         return
+    # Words of other lengths are further apart: the distance is the slow part.
     alike = [sensor for sensor in sorted(names) if abs(len(sensor) - len(name)) <= _LETTERS]
-    apart, nearest = min(
-        ((letters_apart(word, plain(one)), one) for one in alike), default=(_LETTERS + 1, "")
-    )
+    distances = [(letters_apart(word, plain(one)), one) for one in alike]
+    apart, nearest = min(distances, default=(_LETTERS + 1, ""))
     if apart <= _LETTERS and digits(word) <= digits(nearest):
         raise SpellingError(
             f"sensor {name!r} is not known: did you mean {nearest}? The name of a new sensor "
-            "differs from it by more "
-            f"than {_LETTERS} letters"
+            f"differs from it by more than {_LETTERS} letters"
         )
 
 
@@ -97,8 +94,9 @@ class TextTower:
 @shown_short
 @dataclass(frozen=True)
 class ModelConfig:
-    """All shapes and arithmetic of the network; `sensors` names the rows of tokens, or of patch
-    encoders too (T3).
+    """All shapes and arithmetic of the network.
+
+    `sensors` names the rows of the sensor tokens, and of the patch encoders too in T3.
     """
 
     image_size: Size  # Side of an image, pixels.
@@ -136,10 +134,10 @@ class ModelConfig:
     def __post_init__(self) -> None:
         check(self, "--model.")
         if self.decoder.width % 4:
-            width = (
-                f"a multiple of 4 (sines and cosines of rows and columns), not {self.decoder.width}"
+            raise ConfigError(
+                "--model.decoder.width must be a multiple of 4 (sines and cosines of rows and "
+                f"columns), not {self.decoder.width}"
             )
-            raise ConfigError(f"--model.decoder.width must be {width}")
         if self.image_size % self.patch:
             raise ConfigError(
                 f"image_size {self.image_size} must be a multiple of patch {self.patch}"
@@ -168,10 +166,8 @@ class ModelConfig:
             )
         check_spelling(name, self.sensors)
         if name not in self.sensors:
-            known = ", ".join(self.sensors)
-            table = " ".join(self.sensors)
             raise ConfigError(
-                f"unknown sensor {name!r}. Choose one of {known}, or add it by --model.sensors "
-                f"{name} {table}"
+                f"unknown sensor {name!r}. Choose one of {', '.join(self.sensors)}, or add it by "
+                f"--model.sensors {name} {' '.join(self.sensors)}"
             )
         return self.sensors.index(name)

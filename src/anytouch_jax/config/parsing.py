@@ -49,29 +49,21 @@ def parse_json(text: str | bytes) -> Any:
     if len(text) > _JSON_BYTES:
         raise ConfigError(f"has {len(text):,} bytes of JSON, more than {_JSON_BYTES:,}")
 
-    def number(digits: str, kind: type[int] | type[float] = float) -> float:
-        if len(digits) > _JSON_DIGITS:
-            raise ConfigError(f"has a number of {len(digits)} digits")
-        if not math.isfinite(value := kind(digits)):
-            raise ConfigError(f"has the number {digits}, which is out of range")
-        return value
-
-    def distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        names = [name for name, _ in pairs]
-        if len(value := dict(pairs)) < len(pairs):
-            raise ConfigError(f"has {max(names, key=names.count)!r} twice in one object")
-        return value
-
     try:
-        text = text.decode("utf-8") if isinstance(text, bytes) else text
-        kinds: Any = {
-            "parse_int": functools.partial(number, kind=int),
-            "parse_float": number,
-            "parse_constant": number,
-        }
-        value = json.loads(text, object_pairs_hook=distinct, **kinds)
+        if isinstance(text, bytes):
+            text = text.decode("utf-8")
+        value = json.loads(
+            text,
+            object_pairs_hook=_distinct,
+            parse_int=functools.partial(_number, kind=int),
+            parse_float=_number,
+            # NaN and Infinity, which Python's JSON has and `_number` refuses
+            parse_constant=_number,
+        )
+        # Python's own parser gives up at a depth that depends on the stack.
         if _depth(value) > _JSON_DEPTH:
             raise RecursionError
+        # Half of a Unicode pair is a text for Python, and cannot be written to any file.
         json.dumps(value, ensure_ascii=False).encode()
     except RecursionError:
         raise ConfigError(f"has more than {_JSON_DEPTH} levels of JSON") from None
@@ -84,19 +76,36 @@ def parse_json(text: str | bytes) -> Any:
     return value
 
 
+def _number(digits: str, kind: type[int] | type[float] = float) -> float:
+    if len(digits) > _JSON_DIGITS:
+        raise ConfigError(f"has a number of {len(digits)} digits")
+    value = kind(digits)
+    if not math.isfinite(value):
+        raise ConfigError(f"has the number {digits}, which is out of range")
+    return value
+
+
+def _distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    names = [name for name, _ in pairs]
+    value = dict(pairs)
+    if len(value) < len(pairs):
+        raise ConfigError(f"has {max(names, key=names.count)!r} twice in one object")
+    return value
+
+
 def _depth(value: Any) -> int:
     """Return the levels of lists and objects in a JSON value."""
-    inner = (
-        value.values() if isinstance(value, dict) else value if isinstance(value, list) else None
-    )
-    if inner is None:
+    if isinstance(value, dict):
+        inner = list(value.values())
+    elif isinstance(value, list):
+        inner = value
+    else:
         return 0
     return 1 + max(map(_depth, inner), default=0)
 
 
 def check(settings: Any, prefix: str = "") -> None:
-    """Raise ConfigError for a field of a dataclass outside its range, or that is not one of its
-    choices (Literal).
+    """Raise ConfigError for a field of a dataclass outside its range or its choices (Literal).
 
     `prefix` is its section on the command line. None is always in a range. NaN and numbers that are
     infinite in float32 never are. Every entry of a tuple is checked.
@@ -104,7 +113,9 @@ def check(settings: Any, prefix: str = "") -> None:
     kind: Any = type(settings)
     for name, (hint, has_choices, bounds) in _rules(kind).items():
         value = getattr(settings, name)
-        where = f"{prefix}{name.replace('_', '-')}" if prefix else name
+        where = name
+        if prefix:
+            where = f"{prefix}{name.replace('_', '-')}"
         if has_choices:
             read_value(hint, value, where)
         for low, high, words in bounds:
@@ -126,55 +137,29 @@ def _numbers(value: Any) -> Iterator[float]:
 
 @functools.cache
 def _rules(kind: type) -> dict[str, tuple[Any, bool, list[Range]]]:
-    """Return the annotation of each field of a dataclass, whether it has choices, and its
-    ranges.
-    """
+    """Return for each field of a dataclass its annotation, whether it has choices, its ranges."""
 
     def has_choices(hint: Any) -> bool:
         return typing.get_origin(hint) is Literal or any(map(has_choices, typing.get_args(hint)))
 
-    full = typing.get_type_hints(kind, include_extras=True)
-    marks = {name: getattr(hint, "__metadata__", ()) for name, hint in full.items()}
-    ranges = {
-        name: [mark for mark in some if isinstance(mark, Range)] for name, some in marks.items()
-    }
-    return {
-        name: (hint, has_choices(hint), ranges[name])
-        for name, hint in typing.get_type_hints(kind).items()
-    }
+    annotated = typing.get_type_hints(kind, include_extras=True)
+    rules = {}
+    for name, hint in typing.get_type_hints(kind).items():
+        marks = getattr(annotated[name], "__metadata__", ())
+        ranges = [mark for mark in marks if isinstance(mark, Range)]
+        rules[name] = (hint, has_choices(hint), ranges)
+    return rules
 
 
 def read_value(kind: Any, value: Any, where: str) -> Any:
     """Return `value` (from JSON) as an instance of the annotation `kind`.
 
-    `where` is its name in errors.
+    `where` is its name in errors. Raises ConfigError.
     """
     origin = typing.get_origin(kind)
     args = typing.get_args(kind)
     if dataclasses.is_dataclass(kind) and isinstance(kind, type):
-        if not isinstance(value, dict):
-            raise ConfigError(f"{where} must be an object, not {value!r}")
-        hints = typing.get_type_hints(kind)
-        if unknown := sorted(set(value) - set(hints)):
-            raise ConfigError(
-                f"{where} has no setting called {', '.join(unknown)}. Choose from "
-                f"{', '.join(hints)}."
-            )
-        no_default = (
-            f.default is f.default_factory is dataclasses.MISSING for f in dataclasses.fields(kind)
-        )
-        if missing := [
-            name
-            for name, needed in zip(hints, no_default, strict=True)
-            if needed and name not in value
-        ]:
-            raise ConfigError(f"{where} has no {', '.join(missing)}")
-        return kind(
-            **{
-                name: read_value(hints[name], item, f"{where}.{name}")
-                for name, item in value.items()
-            }
-        )
+        return _read_record(kind, value, where)
     if origin in (typing.Union, types.UnionType):
         if value is None and type(None) in args:
             return None
@@ -185,17 +170,43 @@ def read_value(kind: Any, value: Any, where: str) -> Any:
             raise ConfigError(f"{where} must be one of {', '.join(map(str, args))}, not {value!r}")
         return value
     if origin is tuple:
-        if not isinstance(value, list | tuple):
-            raise ConfigError(f"{where} must be a list, not {value!r}")
-        kinds = [args[0]] * len(value) if args[-1] is Ellipsis else list(args)
-        if len(kinds) != len(value):
-            raise ConfigError(f"{where} must have {len(kinds)} entries, not {len(value)}")
-        return tuple(
-            read_value(k, v, f"{where}[{i}]")
-            for i, (k, v) in enumerate(zip(kinds, value, strict=True))
-        )
+        return _read_tuple(args, value, where)
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
+    # a bool is an int in Python
     if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
         raise ConfigError(f"{where} must be {kind.__name__}, not {value!r}")
     return value
+
+
+def _read_record(kind: type, value: Any, where: str) -> Any:
+    """Return an object of JSON as the dataclass `kind`, see `read_value`."""
+    if not isinstance(value, dict):
+        raise ConfigError(f"{where} must be an object, not {value!r}")
+    hints = typing.get_type_hints(kind)
+    if unknown := sorted(set(value) - set(hints)):
+        raise ConfigError(
+            f"{where} has no setting called {', '.join(unknown)}. Choose from {', '.join(hints)}."
+        )
+    needed = [
+        field.name
+        for field in dataclasses.fields(kind)
+        if field.default is field.default_factory is dataclasses.MISSING
+    ]
+    if missing := [name for name in needed if name not in value]:
+        raise ConfigError(f"{where} has no {', '.join(missing)}")
+    settings = {
+        name: read_value(hints[name], item, f"{where}.{name}") for name, item in value.items()
+    }
+    return kind(**settings)
+
+
+def _read_tuple(args: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:
+    """Return a list of JSON as a tuple of the types `args`, see `read_value`."""
+    if not isinstance(value, list | tuple):
+        raise ConfigError(f"{where} must be a list, not {value!r}")
+    kinds = [args[0]] * len(value) if args[-1] is Ellipsis else list(args)
+    if len(kinds) != len(value):
+        raise ConfigError(f"{where} must have {len(kinds)} entries, not {len(value)}")
+    pairs = zip(kinds, value, strict=True)
+    return tuple(read_value(k, v, f"{where}[{i}]") for i, (k, v) in enumerate(pairs))

@@ -1,6 +1,4 @@
-"""Named configurations: presets (sizes of the network, for each stage and recipe), baselines and
-ablations.
-"""
+"""Presets, baselines and ablations: named configurations of a network and its training."""
 
 from __future__ import annotations
 
@@ -51,13 +49,17 @@ def preset(
                 "stage 2 needs towers. Choose --towers scratch or --towers pretrained."
             )
         model = replace(
-            model, image=touch, text=TextTower(text), lora_rank=16 if towers == "pretrained" else 0
+            model,
+            image=touch,
+            text=TextTower(text),
+            lora_rank=16 if towers == "pretrained" else 0,
+            match_head="linear" if recipe == "release" else "mlp",
         )
-        model = replace(model, match_head="linear" if recipe == "release" else "mlp")
         config = replace(config, model=model, towers=towers)
-        config = config.with_settings(
-            {"objective.center_embeddings": towers == "scratch" and recipe == "paper"}
-        )
+        # Untrained towers share one large direction, which the loss would grow until all
+        # embeddings are equal. CLIP's do not, and the release does not subtract it.
+        center = towers == "scratch" and recipe == "paper"
+        config = config.with_settings({"objective.center_embeddings": center})
     if recipe == "release":
         config = config.with_settings({"optim.decay": "cosine", "data.order": "random"})
     return config
@@ -65,12 +67,11 @@ def preset(
 
 @dataclass(frozen=True)
 class Baseline:
-    """A baseline or ablation: the `stages` that it trains, and its `changes` of their configuration
-    by section.field.
+    """A baseline or ablation: what distinguishes a method, on this network and the same data.
 
-    Without `changes_stage1` they are made in stage 2 only. It keeps what distinguishes the method
-    (Sec. 4.1, appendix "Baselines"), on this network and the same data. The ablations are the rows
-    of Table 6.
+    `stages` are those that it trains, and `changes` what it changes in their configuration, by
+    section.field. Without `changes_stage1` they are made in stage 2 only. Baselines are those of
+    Sec. 4.1 and the appendix ("Baselines"), ablations the rows of Table 6.
     """
 
     name: str
@@ -99,9 +100,9 @@ def apply_baseline(name: str, config: Config) -> Config:
     if config.stage not in baseline.stages:
         only = f"only stage {baseline.stages[0]} ({baseline.about})"
         raise UserError(f"baseline {name} has no stage {config.stage}, {only}")
-    return config.with_settings(
-        baseline.changes if config.stage == 2 or baseline.changes_stage1 else {}
-    )
+    if config.stage == 1 and not baseline.changes_stage1:
+        return config
+    return config.with_settings(baseline.changes)
 
 
 def find_baseline(name: str) -> Baseline:
@@ -133,8 +134,7 @@ _ALL = (
     Baseline(
         "tlv_link",
         "TLV-Link: touch-language-vision alignment on stills that have all three; no sensor "
-        "tokens, no "
-        "matching",
+        "tokens, no matching",
         (2,),
         {
             "model.match_head": "none",

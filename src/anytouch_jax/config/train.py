@@ -1,4 +1,4 @@
-"""Configuration of a training run (losses, optimiser, data, schedule), and its strict JSON.
+"""Configuration of a training run: losses, optimiser, data, schedule, and its strict JSON.
 
 Frozen dataclasses without arrays. The comment of each field is its help text on the command line.
 """
@@ -48,6 +48,8 @@ class LossConfig:
     mask_ratio: Share = 0.75  # Share of the patches that is masked.
     norm_pix_loss: bool = False  # Predict pixels that are normalised within each patch.
     next_frame: bool = True  # Predict the next frame of a clip too.
+    # Predict what changes from the last frame to the next one. Not in the paper.
+    next_frame_residual: bool = False
     alpha_tv: NotNegative[float] = 1.0  # Weight of touch and vision (Eq. 4).
     alpha_tl: NotNegative[float] = 1.0  # Weight of touch and text (Eq. 4).
     alpha_vl: NotNegative[float] = 0.2  # Weight of vision and text (Eq. 4).
@@ -57,6 +59,8 @@ class LossConfig:
     """Share of the patches that matching encodes. Not in the paper (after FLIP)."""
     # Weight of depth, shear and force (--model.fields). Not in the paper.
     field_weight: NotNegative[float] = 0.1
+    terms: NotNegative[tuple[tuple[str, float], ...]] = ()
+    """Further terms of the loss (doors.OBJECTIVES) and their weights."""
     # Parts of the batch within which negatives stay. 1 uses the whole batch.
     groups: Count[int] = 1
     # Subtract the batch mean from embeddings, against collapse of untrained towers.
@@ -68,6 +72,18 @@ class LossConfig:
 
     def __post_init__(self) -> None:
         check(self, "--objective.")
+        names = [name for name, _ in self.terms]
+        if len(set(names)) < len(names):
+            raise ConfigError(f"--objective.terms names an objective twice: {', '.join(names)}")
+        if "fields" in names:
+            raise ConfigError(
+                "the weight of fields is --objective.field-weight; leave it out of "
+                "--objective.terms"
+            )
+        if self.next_frame_residual and not self.next_frame:
+            raise ConfigError(
+                "--objective.next-frame-residual needs --objective.next-frame; remove one of them"
+            )
 
     @property
     def keep_ratio(self) -> float:
@@ -149,7 +165,7 @@ class DataConfig:
 class SimulatedConfig:
     """Simulated touches that training draws from (--data simulated). No data set is written."""
 
-    # Where a default differs from the one of `SceneOptions`, it does so on purpose. This is what the
+    # Where a default differs from that of `SceneOptions`, it does so on purpose. This is what the
     # encoders of the package learned from, and wants variety: more objects, every camera, lighter
     # touches. That one is a small data set. Neither may change, because runs and data sets on disk
     # were made with them. The other seed makes the objects of the two different ones.
@@ -235,8 +251,9 @@ class Config:
 
     @property
     def reconstructs(self) -> bool:
-        """Whether batches need the next frame: stage 1, and stage 2 of the release, which keeps
-        stage 1's loss.
+        """Whether batches need the next frame.
+
+        Stage 1 does, and stage 2 of the release, which keeps the loss of stage 1.
         """
         return self.stage == 1 or self.recipe == "release"
 
@@ -247,11 +264,12 @@ class Config:
 
     @property
     def pair_weights(self) -> tuple[float, float, float]:
-        """Factors of (TV, TL, VL) on both directions of InfoNCE (Eq. 4). The release weighs touch
-        and text by alpha.
-        """
+        """Factors of (TV, TL, VL) on the sum of both directions of InfoNCE (Eq. 4)."""
         objective = self.objective
-        text = objective.alpha_tl if self.recipe == "release" else objective.alpha_tl / 2
+        text = objective.alpha_tl / 2
+        if self.recipe == "release":
+            # The release does not halve touch and text, which gives twice the paper's weight.
+            text = objective.alpha_tl
         return objective.alpha_tv / 2, text, objective.alpha_vl / 2
 
     @property
@@ -259,15 +277,14 @@ class Config:
         """Rules (regex over parameter names, frozen?). The first match decides."""
         rules: list[tuple[str, bool]] = [(r"decoder/position$", True)]
         if self.towers == "pretrained":
-            rules += [
-                (r"text/", True),
-                (r"image/blocks/" if self.recipe == "release" else r"image/", True),
-            ]
+            # LoRA adapts the image tower. The release trains what is outside of its blocks whole.
+            image = r"image/blocks/" if self.recipe == "release" else r"image/"
+            rules += [(r"text/", True), (image, True)]
         return (*rules, (r"", False))
 
     @property
     def weight_decay(self) -> tuple[tuple[str, float], ...]:
-        """Rules (regex over parameter names, weight decay). Vectors have none (golden Q8)."""
+        """Rules (regex over parameter names, weight decay). Vectors have none (the release)."""
         return ((r"(bias|scale|class_token)$", 0.0), (r"", self.optim.weight_decay))
 
 
@@ -305,26 +322,35 @@ def from_json(text: str, cls: type = Config, *, allow_retired: bool = True) -> A
     except ConfigError as error:
         raise ConfigError(f"the configuration {error}") from None
     whole = data if cls is Config else {"model": data}
-    sections = (
-        {name: part for name, part in whole.items() if isinstance(part, dict)}
-        if isinstance(whole, dict)
-        else {}
-    )
+    if isinstance(whole, dict):
+        _rename(whole)
+        _drop_retired(whole, allow_retired=allow_retired)
+    where = "config" if cls is Config else cls.__name__.lower()
+    return parsing.read_value(cls, data, where)
+
+
+def _rename(whole: dict[str, Any]) -> None:
+    """Give the settings of version 0.1 their new names, in place."""
     for (section, name), new_name in _RENAMED.items():
-        if name in sections.get(section, ()):
-            sections[section][new_name] = sections[section].pop(name)
-    for section, settings in _RETIRED.items():
-        for name in settings.keys() & sections.get(section, ()):
-            value = sections[section].pop(name)
-            inert = settings[name]
+        settings = whole.get(section)
+        if isinstance(settings, dict) and name in settings:
+            settings[new_name] = settings.pop(name)
+
+
+def _drop_retired(whole: dict[str, Any], *, allow_retired: bool) -> None:
+    """Remove settings that no longer exist, in place. Raises ConfigError, see `from_json`."""
+    for section, retired in _RETIRED.items():
+        settings = whole.get(section)
+        if not isinstance(settings, dict):
+            continue
+        for name in retired.keys() & settings.keys():
+            value = settings.pop(name)
+            inert = retired[name]
             if inert == _RECIPE:
-                inert = whole.get("recipe") == "release" and (
-                    whole.get("stage") == 2 or name == "touch_text_sum"
-                )
+                in_stage2 = whole.get("stage") == 2 or name == "touch_text_sum"
+                inert = whole.get("recipe") == "release" and in_stage2
             if not allow_retired and value != inert:
                 raise ConfigError(
                     f"the run sets {section}.{name} to {value!r}, which this version no longer "
-                    "has. "
-                    "Continue it with version 0.1, or start a new run from it with --init."
+                    "has. Continue it with version 0.1, or start a new run from it with --init."
                 )
-    return parsing.read_value(cls, data, "config" if cls is Config else cls.__name__.lower())

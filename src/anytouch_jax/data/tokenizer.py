@@ -1,6 +1,4 @@
-"""Tokenizers of captions: CLIP's, read from its file, or a small one trained on the captions of a
-data set.
-"""
+"""Tokenizers of captions: CLIP's, read from its file, or a small one trained on captions."""
 
 from __future__ import annotations
 
@@ -16,14 +14,16 @@ from anytouch_jax.files import atomic_write
 
 START = "<|startoftext|>"
 END = "<|endoftext|>"
+_AT_ONCE = 10_000  # texts that are encoded together
+_BYTES = 256  # a byte-level vocabulary has them all, so that any text can be encoded
 
 
 class Tokenizer:
-    """A tokenizer with CLIP's conventions: a start token first, an end token last, padding with the
-    end token.
+    """A tokenizer with CLIP's conventions.
 
-    There are `vocab_size` ids. The end token `end_id` has the largest one, so that pooling at the
-    largest id (golden Q10) reads its position.
+    A text has a start token first and an end token last, and is padded with the end token. There
+    are `vocab_size` ids. The end token `end_id` has the largest one, because CLIP's text tower
+    pools at the position of the largest id: that is the first end token.
     """
 
     def __init__(self, inner: tokenizers.Tokenizer, name: str = "the tokenizer") -> None:
@@ -34,18 +34,18 @@ class Tokenizer:
         if len(empty) != 2 or empty[1] != self.vocab_size - 1:
             raise UserError(
                 f"{name} is not of CLIP's kind: it must put a start and an end token around a "
-                "text, and the end token "
-                "must have the largest id"
+                "text, and the end token must have the largest id"
             )
         self.start_id, self.end_id = empty
         self._inner = inner
 
     def encode(self, texts: Sequence[str], length: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return (ids i32 (L, length), mask bool (L, length)) of L texts.
+        """Return the ids i32 (L, length) and the mask bool (L, length) of L texts.
 
         A long text keeps its first tokens and the end token. A short text is padded with the end
-        token. The mask is true on real tokens including the first end token. Raises UserError for a
-        length below 2.
+        token. The mask is true on real tokens, which include the first end token.
+
+        Raises UserError for a length below 2.
         """
         if length < 2:
             raise UserError(
@@ -62,19 +62,20 @@ class Tokenizer:
         return ids, mask
 
     def longest(self, texts: Sequence[str]) -> int:
-        """Return the number of tokens of the longest text, start and end included; 2 without
-        texts.
-        """
-        starts = range(0, len(texts), 10_000)
-        parts = (
-            self._inner.encode_batch_fast(list(texts[start : start + 10_000])) for start in starts
-        )
-        return max((len(encoding.ids) for part in parts for encoding in part), default=2)
+        """Return the tokens of the longest text, start and end included; 2 without texts."""
+        longest = 2
+        # Encodings of a million captions at once would take gigabytes.
+        for start in range(0, len(texts), _AT_ONCE):
+            part = list(texts[start : start + _AT_ONCE])
+            for encoding in self._inner.encode_batch_fast(part):
+                longest = max(longest, len(encoding.ids))
+        return longest
 
     def save(self, path: str | Path) -> None:
         """Write a tokenizer.json for `load_tokenizer`; `path` is the file or its folder."""
-        path = Path(path)
-        target = path / "tokenizer.json" if path.suffix != ".json" else path
+        target = Path(path)
+        if target.suffix != ".json":
+            target /= "tokenizer.json"
         atomic_write(target, self._inner.to_str())
 
 
@@ -99,18 +100,22 @@ def load_tokenizer(path: str | Path) -> Tokenizer:
 
 
 def train_tokenizer(captions: Iterable[str], vocab_size: int) -> Tokenizer:
-    """Train a byte-level BPE tokenizer of at most `vocab_size` ids; the same captions give the same
-    ids.
+    """Train a byte-level BPE tokenizer of at most `vocab_size` ids.
 
     It encodes any text, in lower case and with single spaces. The start and end token take the last
-    two ids. Raises UserError if there is no caption, or if `vocab_size` is below 258 (the 256 bytes
-    and these two).
+    two ids. The same captions give the same ids, in any order.
+
+    Raises UserError if there is no caption, or if `vocab_size` is below 258: the 256 bytes and the
+    two tokens.
     """
+    # The trainer breaks ties between pairs of tokens by the order in which it met them.
     texts = sorted(set(captions))
     if not texts:
         raise UserError("a tokenizer cannot be trained without captions")
-    if vocab_size < 258:
-        raise UserError(f"a tokenizer needs room for at least 258 tokens, not {vocab_size}")
+    special = [START, END]
+    least = _BYTES + len(special)
+    if vocab_size < least:
+        raise UserError(f"a tokenizer needs room for at least {least} tokens, not {vocab_size}")
     inner = tokenizers.Tokenizer(models.BPE())
     blanks = normalizers.Replace(tokenizers.Regex(r"\s+"), " ")
     inner.normalizer = normalizers.Sequence(
@@ -120,11 +125,13 @@ def train_tokenizer(captions: Iterable[str], vocab_size: int) -> Tokenizer:
     inner.decoder = decoders.ByteLevel()
     alphabet = pre_tokenizers.ByteLevel.alphabet()
     trainer = trainers.BpeTrainer(
-        vocab_size=vocab_size - 2, initial_alphabet=alphabet, show_progress=False
+        vocab_size=vocab_size - len(special), initial_alphabet=alphabet, show_progress=False
     )
     inner.train_from_iterator(texts, trainer)
-    inner.add_special_tokens([START, END])
+    # Added after the training, so that the end token has the largest id.
+    inner.add_special_tokens(special)
+    ids = [(token, inner.token_to_id(token)) for token in special]
     inner.post_processor = processors.TemplateProcessing(
-        single=f"{START} $A {END}", special_tokens=[(t, inner.token_to_id(t)) for t in (START, END)]
+        single=f"{START} $A {END}", special_tokens=ids
     )
     return Tokenizer(inner, "the trained tokenizer")

@@ -18,7 +18,7 @@ import urllib.parse
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager, nullcontext, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
@@ -73,8 +73,7 @@ class CostEstimate(NamedTuple):
         price = "no prices given" if self.cost is None else f"about {self.cost:.2f}"
         return (
             f"{self.questions} questions ({self.cached} answered before), about {self.tokens_in} "
-            "tokens in and "
-            f"{self.tokens_out} out: {price}"
+            f"tokens in and {self.tokens_out} out: {price}"
         )
 
 
@@ -323,39 +322,78 @@ def _parse_reply(reply: Any) -> tuple[str, str, int, int]:
     return text, finish, tokens_in, tokens_out
 
 
+@dataclass(frozen=True)
+class CaptionOptions:
+    """What is asked, and how.
+
+    Args:
+        price_in: price of a million tokens of questions, for the estimate; None if unknown.
+        price_out: price of a million tokens of answers.
+        threads: questions that are open at a time.
+        side: pixels of the long side of an image, which is scaled down to it.
+        split: only rows of this split; None for all.
+        families: family of prompts by the name of a data set, where it is not known.
+        overwrite: ask also for rows that have a caption.
+        second_image: column of a second RGB image.
+        limit: at most so many questions.
+    """
+
+    price_in: float | None = None
+    price_out: float | None = None
+    threads: int = 4
+    side: int = 512
+    split: str | None = None
+    families: Mapping[str, str] | None = None
+    overwrite: bool = False
+    second_image: str = prompts.SECOND_IMAGE
+    limit: int | None = None
+
+
 def annotate(
     manifest: Manifest,
     endpoint: Endpoint,
     folder: str | Path,
     *,
     confirm: Callable[[CostEstimate], bool],
-    price_in: float | None = None,
-    price_out: float | None = None,
-    threads: int = 4,
-    side: int = 512,
-    split: str | None = None,
-    families: Mapping[str, str] | None = None,
-    overwrite: bool = False,
-    second_image: str = prompts.SECOND_IMAGE,
-    limit: int | None = None,
+    options: CaptionOptions | None = None,
     log: Callable[[str], None] = lambda _: None,
+    **settings: Any,
 ) -> CaptionResult:
-    """Ask `endpoint` for every missing caption and return the manifest with all captions.
+    """Ask a vision-language model for every missing caption.
 
-    Each touch, or each sequence without a touch, is one question; `threads` are open at a time.
-    Answers and failures are stored in `folder`. `confirm` is always called with the estimate, and
-    prices are for a million tokens. A phrase that was expanded moves to the column `phrase`. Raises
-    AnnotateError if `confirm` returns False, if the first questions all fail, or if the endpoint
-    cannot be used, and UserError if no caption is missing.
+    Each touch, or each sequence without a touch, is one question. A phrase that was expanded moves
+    to the column `phrase`.
+
+    Args:
+        manifest: the rows to caption.
+        endpoint: the model's server.
+        folder: where answers and failures are stored. What is stored there is not asked again.
+        confirm: is always called with the estimate of the cost; False ends it.
+        options: what is asked, and how.
+        log: gets sentences.
+        **settings: fields of `CaptionOptions`, which take the place of those in `options`.
+
+    Returns:
+        The manifest with all captions, and what was asked and failed.
+
+    Raises:
+        AnnotateError: `confirm` returned False, the first questions all failed, or the endpoint
+            cannot be used.
+        UserError: no caption is missing.
     """
+    options = replace(options or CaptionOptions(), **settings)
     jobs, left_out = prompts.find_caption_jobs(
-        manifest, split=split, families=families, overwrite=overwrite, second_image=second_image
+        manifest,
+        split=options.split,
+        families=options.families,
+        overwrite=options.overwrite,
+        second_image=options.second_image,
     )
-    jobs = jobs[:limit]
+    jobs = jobs[: options.limit]
     store = _AnswerStore(Path(folder).expanduser().resolve())
-    run = _Run(manifest, endpoint, store, side, log)
-    keys = run.keys(jobs, threads)
-    # equal questions about equal images are one
+    run = _Run(manifest, endpoint, store, options.side, log)
+    keys = run.keys(jobs, options.threads)
+    # Equal questions about equal images are one.
     missing: dict[str, prompts.CaptionJob] = {}
     for job, key in zip(jobs, keys, strict=True):
         if key and key not in store.answers:
@@ -363,41 +401,49 @@ def annotate(
     if endpoint.exposes_key:
         log(f"the key travels unencrypted to {endpoint.url}; use https")
     cached = sum(key in store.answers for key in keys)
-    image = _BASE_TOKENS + _TILE_TOKENS * (-(-side // _TILE)) ** 2
-    tokens = [
-        len(job.prompt.system + job.prompt.text) // 4 + image * len(job.images) + 20
-        for job in missing.values()
-    ]
-    tokens_in = sum(tokens)
-    tokens_out = _ANSWER_TOKENS * len(missing)
-    cost = (
-        None
-        if price_in is None or price_out is None
-        else (tokens_in * price_in + tokens_out * price_out) / 1e6
-    )
-    if not confirm(CostEstimate(len(missing), cached, tokens_in, tokens_out, cost)):
+    if not confirm(_estimate(list(missing.values()), cached, options)):
         raise AnnotateError("not confirmed: nothing was asked")
     with store.exclusive() if missing else nullcontext():
         try:
+            # Another process may have stored answers while this one waited for the lock.
             questions = [(key, job) for key, job in missing.items() if key not in store.answers]
-            # earlier failures come last
+            # Earlier failures come last, so that they do not hold up the rest.
             questions.sort(key=lambda question: question[0] in store.failed)
             if questions:
-                # a notebook runs a loop in this thread
+                # A thread of its own, because a notebook has a running event loop in this one.
+                asked = run.ask(_Client(endpoint, log), questions, options.threads)
                 with ThreadPoolExecutor(1) as pool:
-                    pool.submit(
-                        asyncio.run, run.ask(_Client(endpoint, log), questions, threads)
-                    ).result()
+                    pool.submit(asyncio.run, asked).result()
         finally:
             store.write_failures(run.failures, keys)
-    answers = ((job, store.answers.get(key)) for job, key in zip(jobs, keys, strict=True))
-    captions = tuple(
-        Caption(job, answer["caption"], answer["object"]) for job, answer in answers if answer
-    )
-    annotated = _attach(manifest, captions)
+    captions = []
+    for job, key in zip(jobs, keys, strict=True):
+        answer = store.answers.get(key)
+        if answer:
+            captions.append(Caption(job, answer["caption"], answer["object"]))
+    annotated = _attach(manifest, tuple(captions))
     return CaptionResult(
-        annotated, captions, tuple(run.failures), left_out, run.requests, *run.tokens
+        annotated, tuple(captions), tuple(run.failures), left_out, run.requests, *run.tokens
     )
+
+
+def _estimate(
+    missing: Sequence[prompts.CaptionJob], cached: int, options: CaptionOptions
+) -> CostEstimate:
+    """Return what the questions will cost: four letters are about a token, and an image has a base
+    price and one for each of its tiles.
+    """
+    tiles = (-(-options.side // _TILE)) ** 2
+    image = _BASE_TOKENS + _TILE_TOKENS * tiles
+    tokens_in = 0
+    for job in missing:
+        letters = len(job.prompt.system + job.prompt.text)
+        tokens_in += letters // 4 + image * len(job.images) + 20
+    tokens_out = _ANSWER_TOKENS * len(missing)
+    cost = None
+    if options.price_in is not None and options.price_out is not None:
+        cost = (tokens_in * options.price_in + tokens_out * options.price_out) / 1e6
+    return CostEstimate(len(missing), cached, tokens_in, tokens_out, cost)
 
 
 class _Run:
@@ -634,7 +680,8 @@ def sample_sheet(
     chosen = np.sort(np.random.default_rng(0).permutation(len(captions))[:count])
     title = f"{len(chosen)} of {len(captions)} captions"
     page = (
-        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title><style>{_SHEET_STYLE}</style>'
+        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title>'
+        f"<style>{_SHEET_STYLE}</style>"
         f"<h1>{title}</h1><p>Tick what is wrong.</p>"
     )
     page += "".join(_article(manifest, captions[i], number) for number, i in enumerate(chosen, 1))
@@ -643,7 +690,8 @@ def sample_sheet(
 
 
 def _article(manifest: Manifest, caption: Caption, number: int) -> str:
-    job, row = caption.job, int(caption.job.rows[0])
+    job = caption.job
+    row = int(job.rows[0])
     images = list(job.images)
     if not any(column == "path" for _, column in images):  # the model did not see the touch
         images.append((images[0][0] if images else row, "path"))
@@ -659,7 +707,8 @@ def _article(manifest: Manifest, caption: Caption, number: int) -> str:
             continue
         data = base64.b64encode(jpeg).decode()
         parts.append(
-            f'<figure><img src="data:image/jpeg;base64,{data}" alt="{word}"><figcaption>{word}</figure>'
+            f'<figure><img src="data:image/jpeg;base64,{data}" alt="{word}">'
+            f"<figcaption>{word}</figure>"
         )
     notes = [f"phrase: {job.phrase}"] if job.phrase else []
     notes += [

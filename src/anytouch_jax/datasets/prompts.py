@@ -55,20 +55,20 @@ FAMILIES: dict[str, Family] = {
 
 _SYSTEM = (
     "You describe how surfaces feel to the touch. You look at what you are given, name the "
-    "material, and say what a "
-    "fingertip would feel: texture, roughness, hardness, shape of edges and bumps, elasticity. You "
-    "do not mention "
-    "colours, cameras, sensors, images or who is touching."
+    "material, and say what a fingertip would feel: texture, roughness, hardness, shape of edges "
+    "and bumps, elasticity. You do not mention colours, cameras, sensors, images or who is "
+    "touching."
 )
 _FORM = (
-    'Answer with one JSON object and nothing else: {"object": "<what is touched, at most six words>", "caption": '
-    '"<one or two sentences, at most 40 words, that say how the touched place feels>"}.'
+    'Answer with one JSON object and nothing else: {"object": "<what is touched, at most six '
+    'words>", "caption": "<one or two sentences, at most 40 words, that say how the touched place '
+    'feels>"}.'
 )
 _TEXTS: dict[Family, str] = {
     "photograph": (
         "The photograph shows an object or a surface at the moment when it is touched. Decide what "
-        "is touched, near "
-        "where the finger or the sensor is, and describe the tactile properties of that place."
+        "is touched, near where the finger or the sensor is, and describe the tactile properties "
+        "of that place."
     ),
     "object": (
         "{views} The place that is touched may be hidden there. The last picture "
@@ -90,7 +90,8 @@ _TEXTS: dict[Family, str] = {
     ),
 }
 _REFUSAL = re.compile(
-    r"\b(i'?m sorry|i am sorry|as an ai|i can(not|'?t) (see|assist|help|determine|identify|describe|provide|view)|"
+    r"\b(i'?m sorry|i am sorry|as an ai|"
+    r"i can(not|'?t) (see|assist|help|determine|identify|describe|provide|view)|"
     r"unable to (see|assist|help|determine|identify|describe|provide|view))\b",
     re.IGNORECASE,
 )
@@ -327,8 +328,7 @@ def attach_text(
     if not matched:
         raise UserError(
             f"{path}: no key {key!r} of it is in the manifest; its first one is "
-            f"{shown(next(iter(caption_of), None))}; "
-            "name the right column with --key"
+            f"{shown(next(iter(caption_of), None))}; name the right column with --key"
         )
     kept = 0 if overwrite else pc.sum(pc.and_(pc.is_valid(new), pc.is_valid(old))).as_py()
     unused = len(caption_of) - len(at.drop_null().unique())

@@ -26,13 +26,12 @@ from anytouch_jax.data.images import ImageError, decode_bytes, to_rgb
 from anytouch_jax.data.loading.threads import bounded_map
 from anytouch_jax.data.manifest.files import read_file, split_shard_path
 from anytouch_jax.data.manifest.manifest import Files, Manifest, distinct_files, group_rows
-from anytouch_jax.data.manifest.schema import shown
+from anytouch_jax.data.manifest.schema import EXAMPLES, shown
 from anytouch_jax.errors import UserError
 from anytouch_jax.progress import tracked
 
 STATES = ("ok", "missing", "outside", "empty", "truncated", "unreadable")
 OK = STATES.index("ok")
-EXAMPLES = 5  # sentences of a finding
 FIELDS = 4  # colours are the means of 4 x 4 fields
 SPREAD, BOTTOM, BORDER, CHROMA, NOISE = range(5)  # columns of Scan.looks
 _CROP = 128  # side of the middle of a picture where noise is measured

@@ -165,8 +165,7 @@ def _fingerprint(manifest: Manifest, files: Files) -> str:
 def _cannot_pack(manifest: Manifest, row: int, column: str, reason: str) -> PackError:
     return PackError(
         f"{manifest.where(row)}, column {column!r}: {manifest.value(row, column)!r} cannot be "
-        f"packed: {reason}; "
-        "run anytouch data verify with --repair first"
+        f"packed: {reason}; run anytouch data verify with --repair first"
     )
 
 

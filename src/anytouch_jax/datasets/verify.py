@@ -513,8 +513,7 @@ def commercial_only(manifest: Manifest) -> Commercial:
         files = ", ".join(map(str, manifest.files))
         raise UserError(
             f"{files}: no row may certainly be used commercially ({non_commercial} may not, "
-            f"{unknown} do not say). "
-            "Fill in the columns 'license' and 'commercial'."
+            f"{unknown} do not say). Fill in the columns 'license' and 'commercial'."
         )
     return Commercial(select_rows(manifest, np.flatnonzero(use == YES)), non_commercial, unknown)
 
@@ -631,8 +630,8 @@ def _exchange(
             exchanged |= _background_rows(manifest, verdict.rows)
             done.append(
                 f"exchanged touch image and photograph in {verdict.rows.size} rows of dataset "
-                f"{verdict.dataset!r}: "
-                "its photographs resemble the background frames, its touch images do not"
+                f"{verdict.dataset!r}: its photographs resemble the background frames, its touch "
+                "images do not"
             )
     if swap:
         dataset = manifest.column("dataset").to_pylist()

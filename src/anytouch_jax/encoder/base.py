@@ -1,58 +1,45 @@
-"""The touch encoder with its image and text towers: features, similarity, matching,
-preprocessing.
+"""The AnyTouch encoder: features of touch, and its fields in millimetres and newtons.
+
+Its image and text towers are in `encoder.towers`.
 """
 
 from __future__ import annotations
 
-import json
 import math
 import zlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass, field, fields, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
+from anytouch_jax.batch import FieldOutput
 from anytouch_jax.config import UNIVERSAL, Config, ModelConfig, check_spelling
-from anytouch_jax.data.background.rule import RunningGel, other_unit, same_unit, untouched_gel
 from anytouch_jax.data.images import to_rgb
-from anytouch_jax.data.tokenizer import Tokenizer, load_tokenizer
-from anytouch_jax.data.transforms import (
-    Flip,
-    orient_frame,
-    subtract_background,
-    touch_evaluation,
-    vision_evaluation,
-)
+from anytouch_jax.data.transforms import Flip, subtract_background, touch_evaluation
 from anytouch_jax.encoder import arrays
-from anytouch_jax.encoder.arrays import BATCH, Join, Log, Pooling, warn
+from anytouch_jax.encoder.arrays import BATCH, EngineChoice, Join, Log, Params, Pooling, warn
+from anytouch_jax.encoder.features import as_clips as as_clips
+from anytouch_jax.encoder.features import bare_model as bare_model
+from anytouch_jax.encoder.features import check_choices as check_choices
+from anytouch_jax.encoder.features import features_and_fields, network
+from anytouch_jax.encoder.features import precision as precision
+from anytouch_jax.encoder.features import touch_features as touch_features
+from anytouch_jax.encoder.features import touch_only as touch_only
+from anytouch_jax.encoder.interface import Preprocess as Preprocess
+from anytouch_jax.encoder.measured import Fields, Measure, missing, open_measure
+from anytouch_jax.encoder.sensor_words import resolve_sensor
+from anytouch_jax.encoder.towers import PART_NAMES, Towers
 from anytouch_jax.errors import UserError, refuse_forked
-from anytouch_jax.export.engines import EngineChoice
-from anytouch_jax.fields.measure import Fields, Measure, missing, scale_of
-from anytouch_jax.fields.outputs import FieldOutput
-from anytouch_jax.nn.attention import usable
-from anytouch_jax.nn.functional import Net, build
-from anytouch_jax.objectives import normalise_image, normalise_touch
-from anytouch_jax.ops import losses
 from anytouch_jax.shown import count_of, described, leaves
-
-Params = dict[str, Any]
-_PART_NAMES = {
-    "image": "image tower",
-    "text": "text tower",
-    "matcher": "matching head",
-    "logit_scale": "temperature",
-}
 
 
 @dataclass(frozen=True, repr=False)
-class Encoder:
+class Encoder(Towers):
     """A touch encoder with its parameters, and the image and text towers if the weights have them.
 
     `config` and `params` are those of the touch encoder alone, `source` is the path of the weights.
@@ -78,125 +65,124 @@ class Encoder:
         return described(f"{type(self).__name__} {self.source}", **self.about())
 
     def about(self) -> dict[str, str]:
-        """Return what a user wants to know: family, parameters, input, background, features and
-        sensors.
+        """Return what a user wants to know.
+
+        That is family, parameters, input, background, features and sensors.
         """
         model = self.config.model
+        towers = [PART_NAMES[name] for name in ("image", "text") if name in self.others]
+        family = (
+            f"AnyTouch, width {model.touch.width}, depth {model.touch.depth}, "
+            f"{model.touch.heads} heads"
+        )
+        if towers:
+            family += f", with {' and '.join(towers)}"
         count = sum(math.prod(leaf.shape) for leaf in leaves(self.params))
-        towers = [_PART_NAMES[name] for name in ("image", "text") if name in self.others]
-        trained = self.trained_sensors
-        background = "subtracted if it is given" if self.subtracts else "not used"
+        parameters = count_of(count) if count else ""
+        if count and towers:
+            parameters += " of the touch encoder"
+        if self.needs_background:
+            background = "needed, the picture of the untouched gel"
+        elif self.subtracts:
+            background = "subtracted if it is given"
+        else:
+            background = "not used"
+        sensors = ", ".join(model.sensors)
+        if self.trained_sensors:
+            sensors = f"trained on {', '.join(self.trained_sensors)}"
         return {
-            "family": (
-                f"AnyTouch, width {model.touch.width}, depth {model.touch.depth}, "
-                f"{model.touch.heads} heads"
-            )
-            + (f", with {' and '.join(towers)}" if towers else ""),
-            "parameters": count_of(count) + (" of the touch encoder" if towers else "")
-            if count
-            else "",
+            "family": family,
+            "parameters": parameters,
             "input": (
                 f"uint8 RGB {model.image_size} x {model.image_size}, 1 frame or clips of "
                 f"{model.frames} or more"
             ),
-            "background": "needed, the picture of the untouched gel"
-            if self.needs_background
-            else background,
+            "background": background,
             "features": str(model.embed),
-            "sensors": f"trained on {', '.join(trained)}" if trained else ", ".join(model.sensors),
+            "sensors": sensors,
         }
 
-    def __getstate__(self) -> dict[str, Any]:  # compiled programs stay in their process
+    def __getstate__(self) -> dict[str, Any]:
+        # Compiled programs, which are cached properties, stay in their process.
         return {each.name: getattr(self, each.name) for each in fields(self)}
 
-    @cached_property
-    def net(self) -> Net:
-        """The network of the touch encoder."""
-        return build(self.config.model)
-
     def sensor_row(self, name: str, log: Log = warn) -> int:
-        """Return the row of a sensor, or, logged, of the universal tokens (Sec. 3.5). SpellingError
-        for a near name.
+        """Return the row of a sensor, or, logged, of the universal tokens (Sec. 3.5).
+
+        Raises SpellingError for a name that is nearly a known one.
         """
         model = self.config.model
-        name = str(name)
+        word = resolve_sensor(name)
+        name = word.name
+        in_table = name in model.sensors
+        # Without trained sensors nobody knows whether the universal tokens were drawn.
         drawn = self.universal_drawn or not self.trained_sensors
-        known = name in model.sensors
-        if known and (
-            drawn
-            if name == UNIVERSAL
-            else self.trained_sensors is None or name in self.trained_sensors
-        ):
+        if name == UNIVERSAL:
+            is_trained = drawn
+        else:
+            is_trained = self.trained_sensors is None or name in self.trained_sensors
+        if in_table and is_trained:
             return model.sensors.index(name)
-        check_spelling(name, model.sensors)
+        if not word.is_fitted:
+            check_spelling(name, model.sensors)
         why = f"is not in this model's table ({', '.join(model.sensors)})"
-        if known:
+        if word.is_fitted:
+            why = "has no tokens of its own here, which `anytouch adapt` makes"
+        if in_table:
             why = f"was not in training, which had {', '.join(self.trained_sensors or ())}"
-        used = (
-            "the universal tokens"
-            if drawn
-            else "the mean of the trained sensors' tokens (no universal ones)"
-        )
+        used = "the mean of the trained sensors' tokens (no universal ones)"
+        if drawn:
+            used = "the universal tokens"
         log(f"sensor {name!r} {why}: using {used}")
-        if known:
+        # `weights.convert.serve_unseen` has put the tokens that serve it into the row of a sensor
+        # of the table that was never trained.
+        if in_table:
             return model.sensors.index(name)
         return model.universal_row
 
     def computed_in(self, dtype: Literal["trained", "float32", "bfloat16"]) -> Encoder:
-        """Return the same encoder with float32 or bfloat16 arithmetic; "trained" is that of its
-        training.
+        """Return the same encoder with float32 or bfloat16 arithmetic.
+
+        "trained" is that of its training.
         """
         if dtype == "trained":
             return self
         whole = self.whole and replace(self.whole, dtype=dtype)
         return replace(self, config=self.config.with_settings({"model.dtype": dtype}), whole=whole)
 
-    @property
-    def subtracts(self) -> bool:
-        """Whether it subtracts the background of a touch that has one (`data.background`)."""
-        return self.config.data.background != "keep"
-
-    @property
-    def needs_background(self) -> bool:
-        """Whether it was trained on background-subtracted touches only."""
-        return self.config.data.background == "subtract"
-
-    @property
-    def gels(self) -> dict[str, np.ndarray]:
-        """Pictures of the untouched gel by unit, of an exported encoder that stores some."""
-        return {}
-
     @cached_property
     def fingerprint(self) -> str:
         """CRC-32 of the touch encoder's parameters, in hexadecimal."""
-        return f"{zlib.crc32(b''.join(np.ascontiguousarray(x).tobytes() for x in jax.tree.leaves(self.params))):08x}"
+        parts = [np.ascontiguousarray(leaf).tobytes() for leaf in jax.tree.leaves(self.params)]
+        return f"{zlib.crc32(b''.join(parts)):08x}"
 
     @property
     def blank(self) -> np.ndarray:
         """A prepared frame of zeros: its shape and type are those of the input."""
-        return np.zeros((self.config.model.image_size, self.config.model.image_size, 3), np.uint8)
+        side = self.config.model.image_size
+        return np.zeros((side, side, 3), np.uint8)
 
     def input_form(self, frames: int) -> dict[str, Any]:
-        """Return what an exported encoder says about its input, and how a picture becomes a frame
-        of it.
+        """Return what an exported encoder says about its input.
+
+        It says how a picture becomes a frame of it, too.
         """
         side = self.config.model.image_size
-        subtracts = self.subtracts
-        difference = ", background-subtracted: clip(frame - gel + 128, 0, 255)" if subtracts else ""
+        difference = ""
+        resize = (
+            f"the whole picture to {side} x {side}, its shape not kept: OpenCV's INTER_AREA where "
+            f"the shorter side is above {side} pixels, else INTER_LINEAR"
+        )
+        if self.subtracts:
+            difference = ", background-subtracted: clip(frame - gel + 128, 0, 255)"
+            resize += "; the background is subtracted before"
         return {
             "input": (
                 f"frames: uint8 RGB (B, {frames}, {side}, {side}, 3){difference}; sensor: int32 "
                 "(B,)"
             ),
-            "resize": f"the whole picture to {side} x {side}, its shape not kept: OpenCV's INTER_AREA where the "
-            f"shorter side is above {side} pixels, else INTER_LINEAR"
-            + ("; the background is subtracted before" if subtracts else ""),
+            "resize": resize,
         }
-
-    @property
-    def contract(self) -> str:
-        """Everything but the parameters that decides its features, as text."""
-        return json.dumps(asdict(self.config.model), sort_keys=True)
 
     def untrained(self, seed: int = 0) -> Encoder:
         """Return an untrained encoder of the same form: the control of every probe."""
@@ -206,38 +192,27 @@ class Encoder:
         """Return what prepares frames, without parameters."""
         return Encoder(self.config, {}, self.source)
 
+    @property
+    def runs_in_jax(self) -> bool:
+        """Whether `traceable` gives it as a function of jax."""
+        return True
+
     def traceable(
         self, pooling: Pooling = "class", join: Join = "mean"
     ) -> Callable[..., jax.Array]:
-        """Return the function from params, touches u8 (B, T, H, W, 3) and sensor rows (B,) to
-        features (B, E).
+        """Return the function from params, touches and sensor rows to features (B, E).
+
+        Touches are u8 (B, T, H, W, 3), rows (B,).
         """
         return partial(touch_features, net=self.net, pooling=pooling, join=join)
 
     def prepare(self, frame: np.ndarray, background: np.ndarray | None = None) -> np.ndarray:
-        """Return a frame u8 (h, w, 3) as the network reads it, its `background` subtracted if there
-        is one.
+        """Return a frame u8 (h, w, 3) as the network reads it.
+
+        Its `background` is subtracted if there is one.
         """
         frames = [frame] if background is None else subtract_background([frame], background)
         return touch_evaluation(frames, self.config.model.image_size)[0]
-
-    def preprocess(
-        self, frame: npt.ArrayLike, background: npt.ArrayLike | None = None
-    ) -> np.ndarray:
-        """Return a frame (h, w, 3) as RGB u8 (size, size, 3), background-subtracted if the encoder
-        does so.
-
-        Raises UserError if the encoder needs a `background`, and there is none.
-        `untouched_gel(frames)` makes one.
-        """
-        if self.needs_background and background is None:
-            raise UserError(
-                f"{self.source} subtracts the untouched gel. Give its picture, or that of some "
-                "frames: "
-                "encoder.preprocess(frame, at.untouched_gel(frames)). Or prepare all frames with "
-                "at.Preprocess(encoder, frames=frames)."
-            )
-        return Preprocess(self, background)(frame)
 
     def encode_touch(
         self,
@@ -247,37 +222,48 @@ class Encoder:
         pooling: Pooling = "class",
         join: Join = "mean",
     ) -> np.ndarray:
-        """Return features f32 (B, E) of touches u8 RGB (B, T, H, W, 3), (B, H, W, 3) or (H, W, 3);
-        not unit-norm.
+        """Return features f32 (B, E) of touches, not unit-norm.
 
-        H and W are the model's size, see `preprocess`. T is 1 (a still), 3 (a clip) or more: then
-        features of segments of three are joined by `join`. `sensor` is one name, names (B,), or
-        rows i32 (B,). `pooling`: the class token (which alignment trains), the mean of the patch
-        tokens, or both (B, 2E). Raises UserError.
+        Args:
+            frames: u8 RGB (B, T, H, W, 3), (B, H, W, 3) or (H, W, 3). H and W are the model's size,
+                see `preprocess`. T is 1 (a still), 3 (a clip) or more: then features of segments of
+                three are joined by `join`.
+            sensor: one name, names (B,), or rows i32 (B,).
+            pooling: the class token (which alignment trains), the mean of the patch tokens, or both
+                (B, 2E).
+            join: the temporal aggregation of segments.
+
+        Raises:
+            UserError: touches of another form, or another sensor or pooling than there are.
         """
         frames = as_clips(frames)
         side = self.config.model.image_size
         if frames.dtype != np.uint8 or frames.ndim != 5 or frames.shape[2:] != (side, side, 3):
-            convert = "convert values 0 to 255 by np.asarray(frames, np.uint8), and " * (
-                frames.dtype != np.uint8
-            )
+            convert = ""
+            if frames.dtype != np.uint8:
+                convert = "convert values 0 to 255 by np.asarray(frames, np.uint8), and "
             raise UserError(
                 f"touches must be uint8 RGB of {side} x {side} pixels, (B, T, {side}, {side}, 3), "
-                f"not {frames.dtype} "
-                f"{frames.shape}; {convert}resize each frame with encoder.preprocess(frame)"
+                f"not {frames.dtype} {frames.shape}; {convert}resize each frame with "
+                "encoder.preprocess(frame)"
             )
         arrays.check_frames(self.config.model, frames.shape[1])
         check_choices(pooling, join)
-        if len(frames) and (run := self.exported(frames.shape[1], pooling)) is not None:
-            rows = arrays.rows_of_sensors(
-                sensor, len(frames), self.sensor_row, len(self.config.model.sensors)
-            )
-            return run(frames, rows)
+        run = self.exported(frames.shape[1], pooling) if len(frames) else None
+        if run is not None:
+            return run(frames, self._rows(sensor, len(frames)))
         return self._encode(frames, sensor, self.traceable(pooling, join), (pooling, join))
 
+    def _rows(self, sensor: Any, count: int) -> np.ndarray:
+        """Return rows i32 (count,) of a sensor, see `encode_touch`."""
+        return arrays.rows_of_sensors(
+            sensor, count, self.sensor_row, len(self.config.model.sensors)
+        )
+
     def exported(self, frames: int, pooling: Pooling = "class", *, fields: bool = False) -> Any:
-        """Return the export on its engine for touches of `frames` frames, None if XLA computes
-        them.
+        """Return the export on its engine for touches of `frames` frames.
+
+        It is None if XLA computes them.
         """
         if self.engine == "xla" or self.exporter is None:
             return None
@@ -290,12 +276,11 @@ class Encoder:
     def _encode(
         self, clips: np.ndarray, sensor: Any, run: Callable[..., jax.Array], key: Any
     ) -> np.ndarray:
-        """Return `run` of the parameters, clips (B, ...) and rows of their sensors, compiled for a
-        few B and `key`s.
+        """Return `run` of the parameters, clips (B, ...) and rows of their sensors.
+
+        It is compiled once for each `key` and for a few B.
         """
-        rows = arrays.rows_of_sensors(
-            sensor, len(clips), self.sensor_row, len(self.config.model.sensors)
-        )
+        rows = self._rows(sensor, len(clips))
         if key not in self._compiled:
             self._compiled[key] = jax.jit(run)
         with precision(self.config):
@@ -306,65 +291,6 @@ class Encoder:
     def _placed(self) -> Params:
         """The parameters on the device."""
         return jax.device_put(self.params)
-
-    @cached_property
-    def _compiled(self) -> dict[Any, Any]:
-        """What was called: touch by pooling and join, other parts by their method."""
-        return {}
-
-    @cached_property
-    def tokenizer(self) -> Tokenizer | None:
-        """The tokenizer of the text tower."""
-        if self.tokenizer_file is None:
-            return None
-        return load_tokenizer(self.tokenizer_file)
-
-    def encode_image(self, images: Any, *, batch: int = 64) -> np.ndarray:
-        """Return embeddings f32 (B, E) of photographs RGB (h, w, 3), not unit-norm.
-
-        UserError without a tower.
-        """
-
-        def run(net: Net, params: Params, pixels: jax.Array) -> jax.Array:
-            return net.encode_image(params, normalise_image(pixels)).astype(jnp.float32)
-
-        tower = self._part("encode_image", run, "image", "lora")
-        size = self.config.model.image_size
-        images = [images] if getattr(images, "ndim", 0) == 3 else images
-        pixels = (
-            vision_evaluation(to_rgb(np.asarray(image), "the image"), size) for image in images
-        )
-        return self._embeddings(tower, pixels, batch)
-
-    def encode_text(self, texts: str | Sequence[str], *, batch: int = 64) -> np.ndarray:
-        """Return embeddings f32 (L, E) of texts, not unit-norm.
-
-        Raises UserError without a text tower or tokenizer.
-        """
-
-        def run(net: Net, params: Params, batch: tuple[jax.Array, jax.Array]) -> jax.Array:
-            return net.encode_text(params, *batch).astype(jnp.float32)
-
-        tower = self._part("encode_text", run, "text")
-        assert self.whole is not None and self.whole.text is not None
-        tokenizer = self.tokenizer
-        text = self.whole.text
-        if tokenizer is None:
-            raise UserError(
-                f"there is no tokenizer.json in the folder of {self.source}; copy the one of its "
-                "training"
-            )
-        if tokenizer.vocab_size > text.vocab:
-            raise UserError(
-                f"{self.tokenizer_file} has {tokenizer.vocab_size} tokens, the text tower of "
-                f"{self.source} has "
-                f"{text.vocab}; copy the tokenizer of its training"
-            )
-        texts = [texts] if isinstance(texts, str) else list(texts)
-        if not all(isinstance(sentence, str) for sentence in texts):
-            raise UserError("texts must be a string or a sequence of strings")
-        ids, mask = tokenizer.encode(texts, text.length)
-        return self._embeddings(tower, zip(ids, mask, strict=True), batch)
 
     def measure(
         self,
@@ -377,11 +303,18 @@ class Encoder:
     ) -> Fields:
         """Return depth, shear, contact and force of B frames in mm and N, with their deviations.
 
-        `frames` are those of the camera, not prepared: (h, w), (h, w, 3), (B, h, w, 3) or clips (B,
-        T, h, w, 3), whose last frame is measured. A still shows little of slip. `background` is the
-        untouched gel. A sensor that is not in `fields.GELS` needs `width_mm`, the mm that the
-        picture's width shows. Without it lengths are shares of that width, and there is no force.
-        Raises UserError if the weights do not measure.
+        Args:
+            frames: those of the camera, not prepared: (h, w), (h, w, 3), (B, h, w, 3) or clips (B,
+                T, h, w, 3), whose last frame is measured. A still shows little of slip.
+            background: the untouched gel.
+            sensor: its name, or the folder NAME.sensor of a fitted one.
+            width_mm: the mm that the picture's width shows. A name that is not in
+                `fields.measure.GELS` needs it. Without it lengths are fractions of that width, and
+                there is no force.
+            log: takes a sentence on each fault of the frames.
+
+        Raises:
+            UserError: the weights do not measure, or the frames have another form.
         """
         measure = self.measure_of(sensor, background, width_mm, log)
         frames = arrays.as_array(frames, "frames")
@@ -401,9 +334,10 @@ class Encoder:
             ready = np.stack(
                 [[self.preprocess(frame, background) for frame in clip] for clip in part]
             )
-            numbers = np.full(len(part), row, np.int32), np.full(len(part), aspect, np.float32)
-            parts.append(self.encode_and_measure(ready, *numbers)[1])
-        out = FieldOutput._make(
+            rows = np.full(len(part), row, np.int32)
+            aspects = np.full(len(part), aspect, np.float32)
+            parts.append(self.encode_and_measure(ready, rows, aspects)[1])
+        out: FieldOutput[np.ndarray] = FieldOutput._make(
             arrays.check_features(np.concatenate(values)) for values in zip(*parts, strict=True)
         )
         return measure(out, [to_rgb(clip[-1], "the frame") for clip in clips])
@@ -420,16 +354,25 @@ class Encoder:
     ) -> Measure:
         """Return what turns outputs for frames of a sensor into `Fields`: `stream` takes it.
 
-        Raises UserError.
+        Args:
+            sensor: its name, or the folder NAME.sensor of a fitted one.
+            background: the untouched gel, RGB (h, w, 3), as the camera takes it.
+            width_mm: the mm that the picture's width shows, see `measure`.
+            log: takes a sentence on each fault of the first frame.
+            rotate: degrees by which frames are turned clockwise, as `Preprocess` does.
+            flip: how they are mirrored after that.
+
+        Raises:
+            UserError: the weights do not measure.
         """
-        gel = (
-            None
-            if background is None
-            else to_rgb(arrays.as_array(background, "the background"), "the background")
-        )
+        gel = None
+        if background is not None:
+            gel = to_rgb(arrays.as_array(background, "the background"), "the background")
         if not self.measures:
             raise missing(self.source)
-        return Measure(scale_of(self.metadata, sensor, width_mm), sensor, gel, log, rotate, flip)
+        return open_measure(
+            self.metadata, sensor, gel, width_mm=width_mm, log=log, rotate=rotate, flip=flip
+        )
 
     @property
     def measures(self) -> bool:
@@ -439,299 +382,39 @@ class Encoder:
     def encode_and_measure(
         self, clips: np.ndarray, rows: np.ndarray, aspect: np.ndarray, pooling: Pooling = "class"
     ) -> tuple[np.ndarray, FieldOutput]:
-        """Return features and raw fields, see `nn.fields`, of prepared clips u8 (B, T, H, W, 3) in
-        one pass.
+        """Return features and raw fields of prepared clips in one pass.
 
-        `rows` (B,) are those of the sensor, `aspect` (B,) logarithms of the pictures' height over
-        width.
+        Args:
+            clips: u8 (B, T, H, W, 3).
+            rows: (B,), those of the sensor.
+            aspect: (B,), logarithms of the pictures' height over width.
+            pooling: that of the features.
         """
-        if (
-            self.measures
-            and (run := self.exported(clips.shape[1], pooling, fields=True)) is not None
-        ):
-            return run.measure(np.asarray(clips), np.asarray(rows), np.asarray(aspect))
-        if (key := ("fields", pooling)) not in self._compiled:
-            net = build(usable(self.whole or self.config.model))
+        if self.measures:
+            run = self.exported(clips.shape[1], pooling, fields=True)
+            if run is not None:
+                return run.measure(np.asarray(clips), np.asarray(rows), np.asarray(aspect))
+        key = ("fields", pooling)
+        if key not in self._compiled:
+            net = network(self.whole or self.config.model)
             self._compiled[key] = jax.jit(partial(features_and_fields, net=net, pooling=pooling))
+        count = len(clips)
+        given = [arrays.filled(one) for one in (clips, rows, aspect)]
         with precision(self.config):
-            values, out = self._compiled[key](
-                self._placed_fields, *map(arrays.filled, (clips, rows, aspect))
-            )
-        return np.asarray(values)[: len(clips)], FieldOutput._make(
-            np.asarray(x)[: len(clips)] for x in out
-        )
+            values, out = self._compiled[key](self._placed_fields, *given)
+        return np.asarray(values)[:count], FieldOutput._make(np.asarray(x)[:count] for x in out)
 
     @cached_property
     def _placed_fields(self) -> Params:
+        """The parameters of touch encoder and fields on the device."""
         if not self.measures:
             raise missing(self.source)
         return self._placed | jax.device_put({"fields": self.part_params("fields")})
-
-    def _embeddings(self, tower: Callable[[Any], jax.Array], items: Any, batch: int) -> np.ndarray:
-        values = arrays.run_in_batches(
-            lambda part: tower(jax.tree.map(arrays.filled, part)), items, batch
-        )
-        if len(values):
-            return values
-        return np.zeros((0, self.config.model.embed), np.float32)
-
-    def similarity(
-        self,
-        touch: npt.ArrayLike,
-        texts: str | Sequence[str] | np.ndarray,
-        *,
-        probabilities: bool = False,
-    ) -> np.ndarray:
-        """Return the cosine similarity f32 (B, L) of touch features (B, E) and texts, or text
-        embeddings (L, E).
-
-        `probabilities` are their softmax with the learned temperature: a zero-shot classifier.
-        UserError without a tower.
-        """
-        embeddings = (
-            texts
-            if isinstance(texts, np.ndarray) and texts.dtype.kind == "f"
-            else self.encode_text(texts)
-        )  # type: ignore[arg-type]
-        z_touch = np.asarray(touch, np.float32)
-        z_text = np.asarray(embeddings, np.float32)
-        if z_touch.ndim != 2 or z_text.ndim != 2 or z_touch.shape[1] != z_text.shape[1]:
-            width = z_text.shape[-1]
-            raise UserError(
-                f"touch must be features (B, {width}) with pooling class, not {z_touch.shape}"
-            )
-        cosine = _unit(z_touch) @ _unit(z_text).T
-        if not probabilities:
-            return np.asarray(np.clip(cosine, -1, 1))
-        scale = self._part("scale", lambda net, params: net.scale(params), "logit_scale")
-        return np.asarray(jax.nn.softmax(scale() * cosine, axis=1))
-
-    def match(self, first: npt.ArrayLike, second: npt.ArrayLike) -> np.ndarray:
-        """Return matching logits f32 (B,) of two sets of touch features (B, E), pooling class (Eq.
-        5).
-
-        A positive logit predicts the same place. Raises UserError without a matching head, and for
-        other shapes.
-        """
-
-        def run(net: Net, params: Params, first: jax.Array, second: jax.Array) -> jax.Array:
-            return net.match(params, losses.normalise(first), losses.normalise(second))
-
-        head, one, other = (
-            self._part("match", run, "matcher"),
-            *(np.asarray(x, np.float32) for x in (first, second)),
-        )
-        if one.shape != other.shape or one.ndim != 2:
-            raise UserError(
-                f"match takes two sets of features of one shape (B, E), not {one.shape}, "
-                f"{other.shape}"
-            )
-        return np.asarray(head(arrays.filled(one), arrays.filled(other)))[: len(one)]
-
-    def _part(
-        self, method: str, run: Callable[..., jax.Array], name: str, *more: str
-    ) -> Callable[..., jax.Array]:
-        """Return `run` (net, params, ...) compiled with the parameters `name` and `more`, which go
-        to the device.
-        """
-        params = {name: self.part_params(name)}
-        if method not in self._compiled:
-            params |= {key: self.others[key] for key in more if key in self.others}
-            net = build(usable(self.whole or self.config.model))
-            with precision(self.config):
-                self._compiled[method] = partial(jax.jit(partial(run, net)), jax.device_put(params))
-        compiled = self._compiled[method]
-
-        def call(*arguments: Any) -> jax.Array:
-            with precision(self.config):
-                return compiled(*arguments)
-
-        return call
-
-    def part_params(self, name: str) -> Params:
-        """Return the parameters of a part: image, text, decoder, matcher or logit_scale.
-
-        Raises UserError.
-        """
-        if name not in self.others:
-            raise UserError(
-                f"{self.source} has no {_PART_NAMES.get(name, name)}; give a run or file that has "
-                "one"
-            )
-        return dict(self.others)[name]
-
-
-class Preprocess:
-    """Frames of one sensor in the form that an encoder was trained on.
-
-    They are turned by `rotate` degrees, mirrored by `flip` (`data.transforms.orient_frame`) and
-    resized. For an encoder that `subtracts`, the `background` (a picture of the untouched gel) is
-    subtracted first, or the `untouched_gel` of `frames`. Without either, the first frame chooses
-    among the `known` pictures of a head. If none is of its unit, `log` gets a warning, and the
-    frames so far give a running estimate, as for an encoder that needs a background.
-
-    >>> features = encoder.encode_touch(Preprocess(encoder, frames=frames)(camera.read()), "digit")
-    """
-
-    def __init__(
-        self,
-        encoder: Encoder,
-        background: npt.ArrayLike | None = None,
-        *,
-        frames: Iterable[npt.ArrayLike] | None = None,
-        rotate: int = 0,
-        flip: Flip = "none",
-        known: Mapping[str, np.ndarray] | None = None,
-        log: Log = warn,
-    ) -> None:
-        if background is not None and frames is not None:
-            raise UserError("Give a background, or the frames that it is taken from, not both.")
-        self._prepare = encoder.bare().prepare  # workers get no parameters
-        self._subtracts = encoder.subtracts
-        self._orient = partial(orient_frame, rotate=rotate, flip=flip)
-        self._known = dict(known or {})
-        self._log = log
-        self._running = RunningGel() if encoder.needs_background or self._known else None
-        self._background = None if frames is None else untouched_gel(frames)
-        if background is not None:
-            self._background = to_rgb(
-                arrays.as_array(background, "the background"), "the background"
-            )
-        self._gel: tuple[np.ndarray | None, np.ndarray] = None, np.zeros((0, 0, 3), np.uint8)
-
-    @property
-    def background(self) -> np.ndarray | None:
-        """The picture of the untouched gel, RGB u8 (h, w, 3), as the camera takes it; None if there
-        is none (yet).
-        """
-        if self._background is None and self._running:
-            return self._running.picture
-        return self._background
-
-    @property
-    def estimated(self) -> bool:
-        """Whether the background is a running estimate that is not settled."""
-        return self._background is None and self._running is not None and not self._running.settled
-
-    def __repr__(self) -> str:
-        gel = self._background
-        encoder = getattr(self._prepare, "__self__", None)
-        known = (
-            "the first frame" if gel is None else f"a picture of {gel.shape[1]} x {gel.shape[0]}"
-        )
-        used = f"minus {known}" if self._subtracts else "without a background"
-        turned = " ".join(f"{name}={value!r}" for name, value in self._orient.keywords.items())
-        return f"Preprocess(frames of {getattr(encoder, 'source', 'an encoder')}, {used}, {turned})"
-
-    def __call__(self, frame: npt.ArrayLike) -> np.ndarray:
-        """Return a camera's frame (h, w, 3), or grey, RGBA, u16 or floats in 0..1, as the encoder
-        reads it.
-        """
-        frame = to_rgb(arrays.as_array(frame, "the frame"), "the frame")
-        if self._background is None and self._known:
-            known = self._known
-            self._known = {}
-            gel, why = same_unit(known, frame)
-            self._background = None if why else gel
-            if why:
-                self._log(other_unit(why))
-        if self._background is None and self._running is not None:
-            self._running.add(frame)
-        frame = np.ascontiguousarray(self._orient(frame))
-        gel = self.background
-        if gel is None or not self._subtracts:
-            return self._prepare(frame)
-        if self._gel[0] is not gel:
-            self._gel = gel, np.ascontiguousarray(self._orient(gel))
-        return self._prepare(frame, self._gel[1])
-
-
-def _unit(values: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
-    """Return rows divided by their length, or by 1e-12 if that is larger, as `losses.normalise`."""
-    wide = np.asarray(values, np.float64)
-    return np.asarray(
-        wide / np.maximum(np.linalg.norm(wide, axis=-1, keepdims=True), 1e-12), np.float32
-    )
-
-
-def precision(config: Config) -> AbstractContextManager[Any]:
-    """Return a context with 64 bits for a float64 model, else 32.
-
-    Raises UserError if this process cannot use jax.
-    """
-    refuse_forked()
-    return jax.enable_x64(config.model.dtype == "float64")
-
-
-def as_clips(frames: Any) -> np.ndarray:
-    """Return frames (H, W, 3), (B, H, W, 3) or (B, T, H, W, 3) as clips.
-
-    Raises UserError for frames of two sizes.
-    """
-    frames = arrays.as_array(frames, "frames")
-    if frames.ndim == 3:
-        return frames[None, None]
-    if frames.ndim == 4:
-        return frames[:, None]
-    return frames
-
-
-def check_choices(pooling: Pooling, join: Join) -> None:
-    """Raise UserError for another pooling or join than there are."""
-    for name, value, kind in (("pooling", pooling, Pooling), ("join", join, Join)):
-        if value not in get_args(kind):
-            raise UserError(f"{name} is one of {', '.join(get_args(kind))}, not {value!r}")
-
-
-def touch_features(
-    params: Any, clips: jax.Array, sensor: jax.Array, *, net: Net, pooling: Pooling, join: Join
-) -> jax.Array:
-    """Return features f32 (B, E) of touches u8 (B, T, H, W, 3) and sensor rows (B,): a traceable
-    `encode_touch`.
-    """
-    check_choices(pooling, join)
-    clips = normalise_touch(clips)
-    if pooling == "class":
-        return net.encode_touch(params, clips, sensor, join).astype(jnp.float32)
-    # an unused half is not computed
-    both = net.encode_poolings(params, clips, sensor, join)
-    return jnp.concatenate(both if pooling == "both" else both[1:], axis=-1).astype(jnp.float32)
-
-
-def features_and_fields(
-    params: Any,
-    clips: jax.Array,
-    sensor: jax.Array,
-    aspect: jax.Array,
-    *,
-    net: Net,
-    pooling: Pooling,
-) -> tuple[jax.Array, FieldOutput]:
-    """Return features f32 (B, E) and fields of touches u8 (B, T, H, W, 3), sensor rows and aspects
-    (B,).
-    """
-    check_choices(pooling, "mean")
-    token, mean, out = net.encode_and_measure(params, normalise_touch(clips), sensor, aspect)
-    values = {"class": (token,), "mean": (mean,), "both": (token, mean)}[pooling]
-    wide = jax.tree.map(lambda value: value.astype(jnp.float32), out)
-    return jnp.concatenate(values, axis=-1).astype(jnp.float32), wide
 
 
 def random_encoder(config: Config, seed: int = 0) -> Encoder:
     """Return an untrained encoder of the same form: the control of every probe."""
     config = touch_only(config)
     with precision(config):
-        params = {"touch": build(config.model).init(jax.random.key(seed))["touch"]}
+        params = {"touch": network(config.model).init(jax.random.key(seed))["touch"]}
     return Encoder(config, params, f"random({seed})")
-
-
-def bare_model(model: ModelConfig) -> ModelConfig:
-    """Return a model without towers and heads."""
-    return replace(usable(model), image=None, text=None, match_head="none", lora_rank=0, fields=0)
-
-
-def touch_only(config: Config) -> Config:
-    """Return the configuration of the touch encoder alone."""
-    return replace(
-        config, model=bare_model(config.model), data=replace(config.data, on_bad_sample="error")
-    )

@@ -1,12 +1,16 @@
-"""Does touch matter for a task? The same probe on touches that were exchanged, shifted, emptied or
-averaged.
+"""Counterfactual probes: does touch matter for a task?
 
-Each control removes one thing. Shuffled touch is that of another row, and time-shifted touch that
-of half a recording later. Background only is the untouched gel. Mean touch is the mean of all
-features.
+The same probe runs on touches that were exchanged, shifted, emptied or averaged, and each control
+removes one thing. Shuffled touch is that of another row: the classes keep their frequencies.
+Time-shifted touch is that of half a recording later: what stays the same in a recording is kept.
+Background only is the untouched gel: device, light and wear. Mean touch is the mean of all
+features, which is nothing.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +19,16 @@ import numpy as np
 from anytouch_jax.data.background.rule import UnitGels
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest
-from anytouch_jax.encoder.arrays import Log
+from anytouch_jax.encoder.arrays import Array, Log
 from anytouch_jax.encoder.embed import embed_rows
 from anytouch_jax.encoder.encoder import Encoder, load_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import statistics
 from anytouch_jax.evaluate.feature_cache import FeatureSource, FeatureStore, encoder_features
-from anytouch_jax.evaluate.probing import probe_tasks
-from anytouch_jax.evaluate.statistics import Array, GroupSums, interval_text
+from anytouch_jax.evaluate.options import TaskProbeOptions, Tasks
+from anytouch_jax.evaluate.tables import interval_text, markdown_table
+from anytouch_jax.evaluate.task_probes import probe_tasks
+from anytouch_jax.evaluate.verdicts import Runs
 
 REAL = "real touch"
 SHUFFLED = "shuffled touch"
@@ -34,37 +40,55 @@ MEAN = "mean touch"
 def probe_counterfactual(
     models: Sequence[str | Path],
     data: Sequence[str | Path],
-    tasks: Any = "all",
+    tasks: Tasks = "all",
     *,
+    options: TaskProbeOptions | None = None,
     log: Log = print,
-    **options: Any,
+    **changes: Any,
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """Return the results of `probe_tasks` for the five kinds of touch, and what real touch adds to
-    each of the others.
+    """Return results for the five kinds of touch, and what real touch adds to each of the others.
 
-    An entry of the second has task, head, control, difference, low and high: a paired difference of
-    accuracy or R2 with its 95 % interval. Without an untouched gel for every row "background only"
-    is left out. `options` are others of `probe_tasks`. Raises UserError.
+    The first are those of `probe_tasks`. An entry of the second has task, head, control,
+    difference, low and high: a paired difference of accuracy or R2 with its 95 % interval. Without
+    a background for every row "background only" is left out.
+
+    Args:
+        models: the encoder, alone.
+        data: manifests.
+        tasks: as of `probe_tasks`.
+        options: all settings; see `TaskProbeOptions`. Features files, controls and `out` are left
+            alone.
+        log: is called with sentences on what is done.
+        changes: settings by name: fields of `TaskProbeOptions`.
+
+    Raises:
+        UserError: for more than one encoder, and as `probe_tasks` does.
     """
     if len(models) != 1:
         raise UserError(
             f"A counterfactual probe takes one encoder, not {len(models)}. Give one --model."
         )
     table = manifests.read([str(path) for path in data])
-    encoder = load_encoder(models[0])
-    encoding = {name: options[name] for name in ("pooling", "join") if name in options}
-    cache = options.pop("cache", None)
-    sources = touch_sources(table, encoder, cache=cache, log=log, **encoding)
-    runs: dict[tuple[str, ...], list[GroupSums]] = {}
-    options |= {"controls": False, "features": ()}
-    results = probe_tasks(sources, table, tasks, keep=runs, log=log, **options)
+    settings = replace(options or TaskProbeOptions(), **changes)
+    sources = touch_sources(
+        table,
+        load_encoder(models[0]),
+        cache=settings.cache,
+        log=log,
+        pooling=settings.pooling,
+        join=settings.join,
+    )
+    runs: Runs = {}
+    settings = replace(settings, controls=False, features=(), cache=None, out=None)
+    results = probe_tasks(sources, table, tasks, options=settings, keep=runs, log=log)
     gains = []
     for (name, task, head, protocol), several in runs.items():
-        if name != REAL:
-            real = runs[REAL, task, head, protocol]
-            measured = real[0].sums.shape[1] > 2
-            entry = {"task": task, "head": head, "protocol": protocol, "control": name}
-            gains.append(entry | statistics.paired_gain(real, several, measured))
+        if name == REAL:
+            continue
+        real = runs[REAL, task, head, protocol]
+        measured = real[0].sums.shape[1] > 2  # sums of a regression have five columns
+        entry = {"task": task, "head": head, "protocol": protocol, "control": name}
+        gains.append(entry | statistics.paired_gain(real, several, measured))
     return results, gains
 
 
@@ -76,8 +100,10 @@ def touch_sources(
     log: Log = print,
     **encoding: Any,
 ) -> list[FeatureSource]:
-    """Return features of the real touch and of the four controls; "background only" where rows have
-    backgrounds.
+    """Return features of the real touch and of the four controls.
+
+    "background only" is left out where rows have no background. `encoding` are fields of
+    `feature_cache.Encoding`.
     """
     gels = UnitGels(table)
     real = encoder_features(encoder, table, folder=cache, gels=gels, log=log, **encoding)
@@ -92,14 +118,15 @@ def touch_sources(
     def shifted(rows: Array, frames: int) -> Array:
         return shift_in_time(table, rows, frames)
 
-    gel = gels.shared(
-        lambda picture: encoder.prepare(picture, picture if encoder.subtracts else None)
-    )
+    def prepared(picture: Array) -> Array:
+        own_background = picture if encoder.subtracts else None
+        return np.asarray(encoder.prepare(picture, own_background))
+
+    gel = gels.shared(prepared)
 
     def empty(clips: Array, rows: Array) -> Array:
-        return np.broadcast_to(
-            np.stack([np.asarray(gel(row)) for row in rows.tolist()])[:, None], clips.shape
-        )
+        pictures = np.stack([np.asarray(gel(row)) for row in rows.tolist()])
+        return np.broadcast_to(pictures[:, None], clips.shape)
 
     def background(rows: Array, frames: int) -> Array:
         return embed_rows(
@@ -111,9 +138,8 @@ def touch_sources(
         SHUFFLED: from_real(lambda rows, _: shuffle_rows(table, rows)),
         SHIFTED: from_real(shifted),
     }
-    if gels.has(
-        np.flatnonzero(np.isin(table.text_column("split"), ("train", "val", "test")))
-    ).all():
+    taking_part = np.flatnonzero(np.isin(table.text_column("split"), ("train", "val", "test")))
+    if gels.has(taking_part).all():
         stores[BACKGROUND] = FeatureStore(background)
     else:
         log(f"{BACKGROUND}: left out, as some rows have no picture of the untouched gel")
@@ -128,25 +154,29 @@ def shuffle_rows(table: Manifest, rows: Array) -> Array:
     partners = rows.copy()
     for name in np.unique(sensor):
         here = np.flatnonzero(sensor == name)
-        turned = rng.permutation(here)
-        partners[turned] = rows[np.roll(turned, 1)]  # nobody keeps its own
+        # Each takes the row of its neighbour in a random circle, so that nobody keeps its own.
+        circle = rng.permutation(here)
+        partners[circle] = rows[np.roll(circle, 1)]
     return partners
 
 
 def shift_in_time(table: Manifest, rows: Array, frames: int) -> Array:
-    """Return for each of `rows` (n,) the row half a recording later, around the end; one frame
-    alone stays.
+    """Return for each of `rows` (n,) the row half a recording later, around the end.
+
+    One frame alone stays.
     """
-    ends = np.arange(len(table)) if frames == 1 else np.unique(table.clips(frames)[:, -1])
+    if frames == 1:
+        ends = np.arange(len(table))
+    else:
+        ends = np.unique(table.clips(frames)[:, -1])
     sequence = table.codes("sequence", own=True)
     number = np.asarray(table.column("frame_index"))
     ends = ends[np.lexsort((number[ends], sequence[ends]))]
     _, first, place, counts = np.unique(
         sequence[ends], return_index=True, return_inverse=True, return_counts=True
     )
-    later = (np.arange(len(ends)) - first[place] + counts[place] // 2) % counts[place] + first[
-        place
-    ]
+    within = np.arange(len(ends)) - first[place]
+    later = (within + counts[place] // 2) % counts[place] + first[place]
     partner = np.arange(len(table))
     partner[ends] = ends[later]
     return partner[rows]
@@ -154,36 +184,45 @@ def shift_in_time(table: Manifest, rows: Array, frames: int) -> Array:
 
 def verdicts(gains: Sequence[dict[str, Any]]) -> list[str]:
     """Return one sentence for each task and head on whether touch matters."""
+    by_probe: dict[tuple[str, str, str], dict[str, dict[str, Any]]] = {}
+    for gain in gains:
+        key = (gain["task"], gain["head"], gain["protocol"])
+        by_probe.setdefault(key, {})[gain["control"]] = gain
     lines = []
-    for key in dict.fromkeys((gain["task"], gain["head"], gain["protocol"]) for gain in gains):
-        own = {g["control"]: g for g in gains if (g["task"], g["head"], g["protocol"]) == key}
+    for (task, head, _), own in by_probe.items():
+        # Touch of another moment of the recording is touch still, so it decides nothing.
         without = [gain for name, gain in own.items() if name != SHIFTED]
-        above = [gain for gain in without if gain["low"] is not None and gain["low"] > 0]
-        if len(above) == len(without):
+        failed = [gain["control"] for gain in without if not _is_above(gain)]
+        if failed:
+            sentence = (
+                f"There is no sign that touch matters for {task}: real touch is not above "
+                f"{', '.join(failed)}"
+            )
+        else:
             least = min(without, key=lambda gain: gain["difference"])
             points = (
                 f"{100 * least['difference']:.1f} points ({100 * least['low']:.1f} to "
                 f"{100 * least['high']:.1f})"
             )
-            sentence = f"Touch matters for {key[0]}: it adds {points} to {least['control']}"
-            late = own.get(SHIFTED, {"low": None})
-            if late["low"] is not None and (late["low"], late["high"]) != (
-                0,
-                0,
-            ):  # there is another moment
-                sentence += (
-                    ", and the moment matters"
-                    if late["low"] > 0
-                    else ", and any moment of a recording serves"
-                )
-        else:
-            failed = ", ".join(gain["control"] for gain in without if gain not in above)
-            sentence = (
-                f"There is no sign that touch matters for {key[0]}: real touch is not above "
-                f"{failed}"
-            )
-        lines.append(f"{sentence} ({key[1]}).")
+            sentence = f"Touch matters for {task}: it adds {points} to {least['control']}"
+            sentence += _on_the_moment(own.get(SHIFTED))
+        lines.append(f"{sentence} ({head}).")
     return lines
+
+
+def _is_above(gain: dict[str, Any]) -> bool:
+    return gain["low"] is not None and gain["low"] > 0
+
+
+def _on_the_moment(late: dict[str, Any] | None) -> str:
+    """Return whether another moment of the recording would serve as well, to end a sentence."""
+    if late is None or late["low"] is None:
+        return ""
+    if (late["low"], late["high"]) == (0, 0):
+        return ""  # recordings of one frame have no other moment
+    if late["low"] > 0:
+        return ", and the moment matters"
+    return ", and any moment of a recording serves"
 
 
 def gains_table(gains: Sequence[dict[str, Any]]) -> str:
@@ -198,4 +237,4 @@ def gains_table(gains: Sequence[dict[str, Any]]) -> str:
         )
         for gain in gains
     ]
-    return statistics.markdown_table(("task", "head", "compared", "points", "95 %"), rows)
+    return markdown_table(("task", "head", "compared", "points", "95 %"), rows)

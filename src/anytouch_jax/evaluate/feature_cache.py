@@ -1,12 +1,17 @@
-"""Feature caches: features by manifest row, of an encoder, a features file or raw pixels; in memory
-and on disk.
+"""Feature caches: features by manifest row, of an encoder, a features file or raw pixels.
+
+They are kept in memory and, with a folder, on disk. A file is named by everything its features
+depend on, so a change to weights, pictures or settings is another file, and nothing is ever stale.
 """
+
+from __future__ import annotations
 
 import contextlib
 import hashlib
 import json
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -16,17 +21,16 @@ import jax
 import numpy as np
 from sklearn.decomposition import PCA
 
-from anytouch_jax.config import preset
 from anytouch_jax.data.background.rule import ADVICE, UnitGels
 from anytouch_jax.data.loading.samples import read_image
 from anytouch_jax.data.manifest.files import read_file, split_shard_path
 from anytouch_jax.data.manifest.manifest import Manifest, distinct_files
 from anytouch_jax.data.transforms import FORM
-from anytouch_jax.encoder.embed import Features, Join, Pooling, embed_rows, read_npz, save_npz
-from anytouch_jax.encoder.encoder import Encoder, check_frames, load_encoder, random_encoder
+from anytouch_jax.encoder.arrays import Array, Join, Log, Pooling
+from anytouch_jax.encoder.embed import Features, embed_rows, read_npz, save_npz
+from anytouch_jax.encoder.encoder import Encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.heads import Scaling
-from anytouch_jax.evaluate.statistics import RANDOM, RAW, Array
 from anytouch_jax.evaluate.tasks import TaskRows
 from anytouch_jax.files import read_arrays
 
@@ -40,10 +44,10 @@ COMPONENTS = 200  # principal components of raw pixels
 
 
 class FeatureStore:
-    """Features by row and length of clip, each computed once and, with a `folder`, stored in an
-    .npz named by content.
+    """Features by row and length of clip, each computed once.
 
-    `describe()` names everything else that they depend on. It is called only if there is a folder.
+    With a `folder` they are stored in an .npz named by content. `describe()` names everything
+    else that they depend on. It is called only if there is a folder, because it reads pictures.
     """
 
     def __init__(
@@ -61,24 +65,30 @@ class FeatureStore:
     def add(self, rows: Array, frames: int) -> None:
         """Compute the missing features of these rows (any shape) in one pass."""
         if frames not in self._known:
-            self._known[frames] = np.zeros(0, np.int64), np.zeros((0, 0), np.float32)
-            if self._folder is not None:
-                # a damaged file is written again
-                with contextlib.suppress(OSError, ValueError, KeyError):
-                    arrays = read_arrays(self.file(frames))
-                    self._known[frames] = arrays["rows"], arrays["features"]
+            self._known[frames] = self._read(frames)
         known, values = self._known[frames]
         missing = np.setdiff1d(rows, known)
         if not len(missing):
             return
         computed = self._compute(missing, frames)
+        if len(known):
+            computed = np.concatenate([values, computed])
         every = np.concatenate([known, missing])
         order = np.argsort(every)
         every = every[order]
-        values = np.concatenate([values, computed] if len(known) else [computed])[order]
+        values = computed[order]
         self._known[frames] = every, values
         if self._folder is not None:
             save_npz(self.file(frames), Features(values, every, {}), {"about": self._text(frames)})
+
+    def _read(self, frames: int) -> tuple[Array, Array]:
+        """Return the rows, in order, and features that are stored; none without a file."""
+        if self._folder is not None:
+            # a damaged file is written again
+            with contextlib.suppress(OSError, ValueError, KeyError):
+                arrays = read_arrays(self.file(frames))
+                return arrays["rows"], arrays["features"]
+        return np.zeros(0, np.int64), np.zeros((0, 0), np.float32)
 
     def get(self, rows: Array, frames: int) -> Array:
         """Return features f32 (n, k * d) of `rows` (n, k), those of a row joined."""
@@ -88,49 +98,71 @@ class FeatureStore:
 
     def file(self, frames: int) -> Path:
         """Return the file of features of clips of this length."""
-        return (
-            Path(self._folder or ".")
-            / f"{hashlib.sha256(self._text(frames).encode()).hexdigest()[:32]}.npz"
-        )
+        name = hashlib.sha256(self._text(frames).encode()).hexdigest()[:32]
+        return Path(self._folder or ".") / f"{name}.npz"
 
     def _text(self, frames: int) -> str:
         return json.dumps(self._about | {"frames": frames}, sort_keys=True)
 
 
-def encoder_features(
-    encoder: Encoder,
-    table: Manifest,
-    *,
-    pooling: Pooling = "class",
-    join: Join = "mean",
-    order: Order = "right",
-    universal: bool = False,
-    folder: Path | None = None,
-    gels: UnitGels | None = None,
-    log: Callable[[str], None] = lambda _: None,
-) -> FeatureStore:
-    """Return the features of an encoder; `universal`: the universal tokens for every sensor, as for
-    unknown ones.
+@dataclass(frozen=True)
+class Encoding:
+    """How features of a manifest are computed.
+
+    Attributes:
+        pooling: class token, mean of the patch tokens, or both.
+        join: how the segments of a clip longer than the model's are joined.
+        order: of the frames of a clip: as recorded, shuffled, or the last one repeated.
+        universal: the universal tokens for every sensor, as for unknown ones.
+        folder: keeps features on disk.
+        gels: backgrounds of the manifest's sensor instances, found anew without.
+        log: is called with sentences on what is done.
     """
-    gels = gels or UnitGels(table)
+
+    pooling: Pooling = "class"
+    join: Join = "mean"
+    order: Order = "right"
+    universal: bool = False
+    folder: Path | None = None
+    gels: UnitGels | None = None
+    log: Log = lambda _: None
+
+
+def encoder_features(
+    encoder: Encoder, table: Manifest, encoding: Encoding | None = None, **changes: Any
+) -> FeatureStore:
+    """Return the features of an encoder; `changes` are fields of `Encoding` by name."""
+    how = replace(encoding or Encoding(), **changes)
+    gels = how.gels or UnitGels(table)
 
     def describe() -> dict[str, Any]:
-        about = {
-            "pooling": pooling,
-            "join": join,
-            "universal": universal,
+        content = _content(table, encoder_digest(encoder), how.order)
+        content |= {
+            "pooling": how.pooling,
+            "join": how.join,
+            "universal": how.universal,
             "background": encoder.config.data.background,
         }
-        content = _content(table, encoder_digest(encoder), order) | about
-        return content | ({"gels": gels.digest()} if encoder.subtracts else {})
+        if encoder.subtracts:
+            content["gels"] = gels.digest()
+        return content
 
     def compute(rows: Array, frames: int) -> Array:
-        sensor_row = encoder.config.model.universal_row if universal else None
-        edit = partial(reorder_frames, order=order)
-        about: dict[str, Any] = {"sensor_row": sensor_row, "edit": edit, "gels": gels, "log": log}
-        return embed_rows(encoder, table, rows, frames, pooling, join, **about)[1]
+        sensor_row = encoder.config.model.universal_row if how.universal else None
+        return embed_rows(
+            encoder,
+            table,
+            rows,
+            frames,
+            how.pooling,
+            how.join,
+            sensor_row=sensor_row,
+            edit=partial(reorder_frames, order=how.order),
+            gels=gels,
+            log=how.log,
+        )[1]
 
-    return FeatureStore(compute, describe, folder)
+    return FeatureStore(compute, describe, how.folder)
 
 
 def pixel_features(
@@ -140,34 +172,38 @@ def pixel_features(
     folder: Path | None = None,
     gels: UnitGels | None = None,
 ) -> FeatureStore:
-    """Return raw pixels (24 x 32 x 3) of the last frame and every frame minus the background, in
-    0..1.
+    """Return raw pixels of the last frame, and every frame minus the background.
+
+    Both are area averages of 24 x 32 x 3 in 0..1. They are the control that needs no network.
     """
-    gels = gels or UnitGels(table)
+    known = gels or UnitGels(table)
+    # Every picture comes to one size first, so that devices with other resolutions, or with odd
+    # sizes that 24 x 32 does not divide, are averaged over the same areas.
     read = _pair_reader(
-        table, gels, lambda image: cv2.resize(image, RAW_SIZE[::-1], interpolation=cv2.INTER_AREA)
+        table, known, lambda image: cv2.resize(image, RAW_SIZE[::-1], interpolation=cv2.INTER_AREA)
     )
 
+    def describe() -> dict[str, Any]:
+        return _content(table, "raw pixels in colour", order) | {"gels": known.digest()}
+
     def compute(rows: Array, frames: int) -> Array:
-        clips = table.clips(frames) if frames > 1 else np.arange(len(table))[:, None]
+        clips = np.arange(len(table))[:, None]
+        if frames > 1:
+            clips = table.clips(frames)
         windows = reorder_frames(clips[np.searchsorted(clips[:, -1], rows)], rows, order)
+        # Clips of neighbouring rows share frames: each is read once.
         single, places = np.unique(windows, return_inverse=True)
         pixels = np.stack([raw_pixels(*read(int(row))) for row in single])
         last, differences = np.split(pixels, 2, axis=1)
         places = places.reshape(windows.shape)
-        return np.concatenate(
-            [last[places[:, -1]], differences[places].reshape(len(rows), -1)], axis=1
-        )
+        every_difference = differences[places].reshape(len(rows), -1)
+        return np.concatenate([last[places[:, -1]], every_difference], axis=1)
 
-    name = "raw pixels in colour"
-    return FeatureStore(
-        compute, lambda: _content(table, name, order) | {"gels": gels.digest()}, folder
-    )
+    return FeatureStore(compute, describe, folder)
 
 
 def file_features(path: Path, table: Manifest) -> FeatureStore:
-    """Return the features of an .npz file: arrays `features` (n, d) and `rows` (n,) of the
-    manifest.
+    """Return the features of an .npz file: `features` (n, d) and `rows` (n,) of the manifest.
 
     Raises UserError for another file or manifest, and, when they are read, for other clips and
     missing rows.
@@ -182,11 +218,12 @@ def file_features(path: Path, table: Manifest) -> FeatureStore:
             f"{len(table) - 1}."
         )
     paths = features.keys.get("path")
-    if (
-        paths is not None
-        and (paths != table.text_column("path")[rows]).any()
-        and len(table.files) == 1
-    ):
+    # Paths of joined manifests are relative to several folders, so they are not compared.
+    if paths is not None and len(table.files) == 1:
+        differs = (paths != table.text_column("path")[rows]).any()
+    else:
+        differs = False
+    if differs:
         raise UserError(
             f"{path} holds features of another manifest. Its paths differ from those of these rows."
         )
@@ -211,8 +248,10 @@ def file_features(path: Path, table: Manifest) -> FeatureStore:
 
 
 def reorder_frames(clips: Array, rows: Array, order: Order) -> Array:
-    """Return clips (n, T, ...) untouched, with frames shuffled (by the row's number), or with the
-    last repeated.
+    """Return clips (n, T, ...) with their frames in another order.
+
+    "right" leaves them, "repeated" repeats the last, and "shuffled" draws an order by the row's
+    number, never the right one. What a probe loses by it is what it had from motion.
     """
     frames = clips.shape[1]
     if order == "right" or frames == 1:
@@ -232,33 +271,35 @@ def reorder_frames(clips: Array, rows: Array, order: Order) -> Array:
 
 
 def _content(table: Manifest, parameters: str, order: Order) -> dict[str, Any]:
-    about = {
+    """Return what all features of a manifest depend on."""
+    return {
+        "version": VERSION,
+        "order": order,
         "parameters": parameters,
         "manifest": table.content_hash,
         "pictures": image_digest(table),
     }
-    return {"version": VERSION, "order": order, **about}
 
 
 def encoder_digest(encoder: Encoder) -> str:
     """Return SHA-256 over the parameters and the model config."""
     digest = hashlib.sha256(encoder.contract.encode())
-    leaves = jax.tree_util.tree_leaves_with_path(encoder.params)
-    for name, leaf in sorted(
-        (jax.tree_util.keystr(path, simple=True, separator="/"), leaf) for path, leaf in leaves
-    ):
-        array = np.ascontiguousarray(leaf)
+    leaves = {}
+    for path, leaf in jax.tree_util.tree_leaves_with_path(encoder.params):
+        leaves[jax.tree_util.keystr(path, simple=True, separator="/")] = leaf
+    for name in sorted(leaves):
+        array = np.ascontiguousarray(leaves[name])
         digest.update(f"{name} {array.dtype} {array.shape}".encode())
         digest.update(array.view(np.uint8).data if array.size else b"")
     return digest.hexdigest()
 
 
 def image_digest(table: Manifest, count: int = 32) -> str:
-    """Return SHA-256 over size and mtime of each frame (or its shard), all backgrounds and `count`
-    sampled frames.
+    """Return SHA-256 over what tells that pictures changed under an equal manifest.
 
-    Pictures may change under an equal manifest. A copy of the folder that keeps its times has the
-    same digest.
+    That is size and mtime of each frame (or its shard), the bytes of all backgrounds, and those of
+    `count` sampled frames: reading all would take as long as encoding them. A copy of the folder
+    that keeps its times has the same digest.
     """
     digest = hashlib.sha256()
     files = distinct_files(table, ("path", "background_path"))
@@ -270,7 +311,9 @@ def image_digest(table: Manifest, count: int = 32) -> str:
                 digest.update(read_file(file))
                 continue
             shard = split_shard_path(file)
-            about = os.stat(shard[0] if shard else file)
+            if shard:
+                file = shard[0]
+            about = os.stat(file)
             digest.update(f"{about.st_size} {about.st_mtime_ns} ".encode())
     for row in np.unique(np.linspace(0, len(table) - 1, count).astype(int)):
         with contextlib.suppress(OSError, ValueError):
@@ -279,13 +322,15 @@ def image_digest(table: Manifest, count: int = 32) -> str:
 
 
 def raw_pixels(frame: Array, background: Array | None) -> Array:
-    """Return pixels in colour, and minus the background (0 if None): u8 RGB (h, w, 3) -> f32 (2 *
-    24 * 32 * 3,).
+    """Return pixels in colour, then minus the background, f32 (2 * 24 * 32 * 3,).
+
+    `frame` and `background` are u8 RGB (h, w, 3). Without a background the second half is 0.
     """
     pixels = _small(frame)
-    return np.concatenate(
-        [pixels, np.zeros_like(pixels) if background is None else pixels - _small(background)]
-    )
+    difference = np.zeros_like(pixels)
+    if background is not None:
+        difference = pixels - _small(background)
+    return np.concatenate([pixels, difference])
 
 
 def _pair_reader(
@@ -301,9 +346,11 @@ def background_difference(table: Manifest, rows: Array, gels: UnitGels | None = 
 
     Raises UserError without one.
     """
-    read = _pair_reader(
-        table, gels or UnitGels(table), lambda one: (_small(one), one.shape[1] / one.shape[0])
-    )
+
+    def prepare(image: Array) -> tuple[Array, float]:
+        return _small(image), image.shape[1] / image.shape[0]
+
+    read = _pair_reader(table, gels or UnitGels(table), prepare)
     values = np.zeros((len(rows), SMALL[0] * SMALL[1] * 3), np.float32)
     for place, row in enumerate(map(int, rows)):
         (frame, proportion), background = read(row)
@@ -325,6 +372,7 @@ def principal_components(
 ) -> Array:
     """Return `features` (n, d) on the principal components of their `train` (n,) rows.
 
+    Only rows of train decide the directions, as a component of test rows would be fitted on test.
     Raises UserError without any.
     """
     fitted = features[np.asarray(train, bool)]
@@ -342,101 +390,38 @@ def _small(image: Array) -> Array:
 
 
 def pixel_components(store: FeatureStore, rows: TaskRows) -> Array:
-    """Return the principal components of raw pixels, fitted on the rows of train (on all without
-    these).
+    """Return the principal components of raw pixels, fitted on the rows of train.
+
+    Where there are none, as where groups are left out in turn, all rows decide them.
     """
     train = rows.split == "train"
-    return principal_components(store.get(rows.rows, 1), train if train.any() else ~train)
+    if not train.any():
+        train = ~train
+    return principal_components(store.get(rows.rows, 1), train)
 
 
 class FeatureSource(NamedTuple):
-    """Features with their name; `encoder` is None for a features file and for raw pixels."""
+    """Features with their name, and how a probe treats them.
+
+    `encoder` is None for a features file and for raw pixels. `scaling` is that of a linear head.
+    "common" says too that the features are pixels, of which principal components are probed. A
+    `is_control` is what a user would compare with.
+    """
 
     name: str
     store: FeatureStore
     encoder: Encoder | None = None
     scaling: Scaling = "column"
+    is_control: bool = False
 
     def notes(self, sensors: Array) -> list[str]:
         """Return a note on sensors that the encoder was not trained on, or nothing."""
         if self.encoder is None:
             return []
         trained = self.encoder.trained_sensors
-        unknown = sorted(
-            set(sensors) - set(self.encoder.config.model.sensors if trained is None else trained)
-        )
+        if trained is None:
+            trained = self.encoder.config.model.sensors
+        unknown = sorted(set(sensors) - set(trained))
         if unknown:
             return [f"universal tokens for {', '.join(unknown)}"]
         return []
-
-
-def opened(models: Sequence[str | Path | FeatureSource]) -> list[Encoder | FeatureSource]:
-    """Return the encoders of names and paths, and other sources unchanged."""
-    return [one if isinstance(one, FeatureSource) else load_encoder(one) for one in models]
-
-
-def with_gel(rows: TaskRows, gels: UnitGels, models: Sequence[Encoder | FeatureSource]) -> TaskRows:
-    """Return the rows that all models can read, for those that need an untouched gel.
-
-    Raises UserError without any.
-    """
-    encoders = [one if isinstance(one, Encoder) else one.encoder for one in models]
-    if not any(encoder is not None and encoder.needs_background for encoder in encoders):
-        return rows
-    has = np.all(gels.has(rows.rows.ravel()).reshape(rows.rows.shape), axis=1)
-    if not has.any():
-        raise UserError(
-            f"None of {len(rows.rows)} rows has a picture of the untouched gel to subtract. "
-            f"{ADVICE}"
-        )
-    note = f"{(~has).sum()} rows are left out: they have no picture of the untouched gel"
-    return rows.take(np.flatnonzero(has))._replace(
-        notes=(*rows.notes, *([] if has.all() else [note]))
-    )
-
-
-def sources(
-    table: Manifest,
-    models: Sequence[Encoder | FeatureSource],
-    features: Sequence[str | Path],
-    controls: bool,
-    cache: Path | None,
-    rows: dict[int, Array],
-    order: Order = "right",
-    least: int = 1,
-    *,
-    gels: UnitGels,
-    **encoding: Any,
-) -> list[FeatureSource]:
-    """Return models, the random encoder, features files and raw pixels, in this order.
-
-    `rows` by length of clip: a file that lacks some is reported before the work. `least`: frames of
-    every clip.
-    """
-    several = [model for model in models if isinstance(model, FeatureSource)]
-    encoders = {model.source: model for model in models if isinstance(model, Encoder)}
-    if controls:
-        first = next(
-            (one for one in (*encoders.values(), *(source.encoder for source in several)) if one),
-            None,
-        )
-        encoders[RANDOM] = first.untrained() if first else random_encoder(preset("tiny"))
-    for name, encoder in encoders.items():
-        check_frames(encoder.config.model, least)
-        store = encoder_features(encoder, table, order=order, folder=cache, gels=gels, **encoding)
-        several.append(FeatureSource(name, store, encoder))
-    for path in features:
-        several.append(FeatureSource(str(path), file_features(Path(path), table)))
-        for frames, ids in rows.items():
-            several[-1].store.add(ids, frames)
-    if controls:
-        several.append(
-            FeatureSource(
-                RAW, pixel_features(table, order=order, folder=cache, gels=gels), None, "common"
-            )
-        )
-    if not several:
-        raise UserError(
-            "There is nothing to probe. Give --model or --features, or keep the controls."
-        )
-    return several

@@ -1,9 +1,8 @@
-"""Reconstruction errors of stage 1 on masked pixels, baselines without a model, and pictures of
-reconstructions.
-"""
+"""Reconstruction errors of stage 1 on masked pixels, guesses without a model, and pictures."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from anytouch_jax.config import IMAGENET_MEAN, IMAGENET_STD, Config
+from anytouch_jax.data.background.contact import known_contact
 from anytouch_jax.data.loading.samples import evaluation
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.data.transforms import UNTOUCHED
@@ -21,8 +21,11 @@ from anytouch_jax.objectives import normalise_touch, reconstruct
 from anytouch_jax.ops import losses, tokens
 
 if TYPE_CHECKING:
+    from anytouch_jax.encoder.encoder import Encoder
     from anytouch_jax.nn.functional import Net
 
+_CLIPS = 240  # on which errors in contact are measured
+# of the panels: colour of hidden patches, gaps and heights of titles in pixels
 _GREY = np.uint8(128)
 _GAP = 4
 _TITLE = 16
@@ -31,13 +34,21 @@ _TITLE = 16
 def pixel_scores(
     params: Any, manifest: Manifest, ends: np.ndarray, *, net: Net, config: Config
 ) -> dict[str, float]:
-    """Return the mean squared errors of normalised pixels (Eq. 1, 2) of the clips that end at rows
-    `ends`.
+    """Return the mean squared errors of normalised pixels (Eq. 1, 2) of some clips.
 
     "reconstruction" (masked patches) and "next_frame" are those of stage 1. Those that begin with
-    "plain" are of `plain_reconstruction`, and with "untouched" of an untouched gel, if the
-    background is subtracted. Sensors outside the table get the universal tokens. Raises ValueError
-    without rows, and for `norm_pix_loss`.
+    "plain" are of `plain_reconstruction`, and with "untouched" of the background, if it is
+    subtracted. Sensors outside the table get the universal tokens.
+
+    Args:
+        params: of stage 1, with the decoder.
+        manifest: of the clips.
+        ends: rows (n,) at which they end.
+        net: of the parameters.
+        config: of the run.
+
+    Raises:
+        ValueError: without rows, and for `norm_pix_loss`, whose errors are not of pixels.
     """
     if config.objective.norm_pix_loss or not len(ends):
         raise ValueError("pixels are scored on at least one clip, and not with norm_pix_loss")
@@ -60,6 +71,26 @@ def pixel_scores(
     return {name: value / count for name, value in sums.items()}
 
 
+def contact_errors(
+    params: Any, manifest: Manifest, ends: np.ndarray, encoder: Encoder
+) -> dict[str, Any]:
+    """Return errors of stage 1 and of guesses on clips in contact, {} if there are none.
+
+    Frames without contact are the background in every patch, so they would flatter everything.
+    `ends` are the last rows of clips, of which at most 240 are scored.
+    """
+    # in contact or unknown
+    ends = ends[known_contact(manifest)[ends] != 0]
+    config = encoder.config
+    if config.objective.norm_pix_loss or not len(ends):
+        return {}
+    ends = ends[np.linspace(0, len(ends) - 1, min(_CLIPS, len(ends))).astype(int)]
+    config = replace(config, data=replace(config.data, batch_size=min(48, len(ends))))
+    return {"clips": len(ends)} | pixel_scores(
+        params, manifest, ends, net=encoder.net, config=config
+    )
+
+
 @partial(jax.jit, static_argnames=("net", "config"))
 def _errors(
     params: Any, clip: Any, sensor: Any, noise: Any, *, net: Net, config: Config
@@ -72,35 +103,42 @@ def _errors(
         gel = normalise_touch(jnp.full(clip.shape, UNTOUCHED, jnp.uint8))
         predictions["untouched "] = tokens.patchify(gel, net.model.patch)
     has_next = clip.shape[1] > net.model.frames
-    return {
-        kind + term: value
-        for kind, prediction in predictions.items()
-        for term, value in losses.reconstruction_loss(
-            prediction, target, hidden, next_frame=has_next
-        )[1].items()
-    }
+    errors = {}
+    for kind, prediction in predictions.items():
+        _, terms = losses.reconstruction_loss(prediction, target, hidden, next_frame=has_next)
+        for term, value in terms.items():
+            errors[kind + term] = value
+    return errors
 
 
 def plain_reconstruction(target: Any, hidden: Any, frames: int) -> Any:
-    """Return patches (B, N, T, C): the mean of those not `hidden` (B, N); after `frames` a copy of
-    the last frame.
+    """Return a guess without a model: what learning must beat.
+
+    Patches (B, N, T, C) are the mean of those that are not `hidden` (B, N), and after `frames` a
+    copy of the last frame.
     """
     visible = ~hidden[:, :, None, None]
     mean = (target * visible).sum(axis=1, keepdims=True) / visible.sum(axis=1, keepdims=True)
     prediction = jnp.broadcast_to(mean, target.shape)
-    return jnp.concatenate(
-        [prediction[:, :, :frames], target[:, :, frames - 1 : target.shape[2] - 1]], axis=2
-    )
+    last = target[:, :, frames - 1 : target.shape[2] - 1]
+    return jnp.concatenate([prediction[:, :, :frames], last], axis=2)
 
 
 def reconstruction_panels(
     params: Any, clip: Any, sensor: Any, *, net: Net, config: Config, seed: int = 0
 ) -> np.ndarray:
-    """Return an RGB image u8 with a row per sample: original, masked input, reconstruction, next
-    frame, prediction.
+    """Return an RGB image u8 with a row per sample.
 
-    `clip` u8 (B, T, H, W, 3), `sensor` i32 (B,). With `norm_pix_loss` the true mean and spread are
-    put back.
+    Its columns are original, masked input, reconstruction, next frame and prediction. With
+    `norm_pix_loss` the true mean and spread are put back, since the model does not predict them.
+
+    Args:
+        params: of stage 1, with the decoder.
+        clip: u8 (B, T, H, W, 3).
+        sensor: rows of the table of sensors, i32 (B,).
+        net: of the parameters.
+        config: of the run.
+        seed: of the masks.
     """
     refuse_forked()
     patch = net.model.patch
@@ -141,4 +179,5 @@ def reconstruction_panels(
 
 @partial(jax.jit, static_argnames=("net", "config"))
 def _predict(params: Any, clip: Any, sensor: Any, noise: Any, *, net: Net, config: Config) -> Any:
+    """Return predicted patches (B, N, T, C) and which were hidden (B, N)."""
     return reconstruct(params, normalise_touch(clip), sensor, noise, net=net, config=config)

@@ -1,19 +1,22 @@
-"""Cross-sensor retrieval and matching: recall of the same touch by another sensor, among similar
-touches.
+"""Cross-sensor retrieval and matching: the same touch by another sensor, among similar touches.
 
 For each query touch of sensor A, a gallery of touches of sensor B has that touch once. The
-distractors are its nearest neighbours in position, depth and force. Equal scores share their ranks
-evenly, so constant features score chance.
+distractors are its nearest neighbours in position, depth and force. Against random distractors,
+features that know no more than where and how hard a touch was would win: a deep touch at the edge
+looks like no other. In a matched gallery only what was touched is left to tell.
+
+Equal scores share their ranks evenly, so constant features score chance.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise, permutations, product
 from typing import Any, Literal
 
 import numpy as np
+import numpy.typing as npt
 from sklearn.metrics import roc_auc_score
 
 from anytouch_jax.config import FIELD_SENSORS
@@ -22,7 +25,7 @@ from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder.arrays import unit_rows
 from anytouch_jax.encoder.encoder import Encoder
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate.statistics import Array, mean_interval
+from anytouch_jax.evaluate.statistics import Array, fraction_interval, mean_interval
 from anytouch_jax.evaluate.tasks import best_rows
 
 Metric = Literal["cosine", "euclidean"]
@@ -40,9 +43,9 @@ _CHUNK = 1024  # queries whose scores are in memory at a time
 
 @dataclass(frozen=True, eq=False)
 class QueryScores:
-    """Each query's key, its recall (0..1) at 1 and at 5 as a mean over galleries, and its group.
+    """Recall of each query at 1 and at 5 (0..1, means over galleries), with its key and group.
 
-    See `difference`.
+    The keys tell `difference` whether two results are of the same queries.
     """
 
     keys: Array
@@ -53,13 +56,30 @@ class QueryScores:
 
 @dataclass(frozen=True)
 class Retrieval:
-    """Retrieval by one set of features; shares are in 0..1.
+    """Retrieval by one set of features; fractions are in 0..1.
 
-    `top1`, `top5`: recall@1 and recall@5. `low`, `high` (and those of top 5): 95 % interval under a
-    bootstrap over the groups (objects), None with fewer than two. `chance1`, `chance5`: recall of
-    constant features. `matched`: covariates in which distractors are near, empty for random
-    galleries. `nearness`: mean distance of the distractors to the true touch, over that of all
-    candidates. `centred`: the mean feature of each sensor was subtracted.
+    Attributes:
+        name: of the features.
+        query_sensor: "all" in pooled results.
+        gallery_sensor: "all" in pooled results.
+        metric: by which touches are near.
+        centred: the mean feature of each sensor was subtracted.
+        matched: covariates in which distractors are near, empty for random galleries.
+        top1: recall@1.
+        low: lower end of its 95 % interval under a bootstrap over the groups (objects), None with
+            fewer than two.
+        high: its upper end.
+        top5: recall@5, with its interval.
+        top5_low: lower end of that interval.
+        top5_high: its upper end.
+        chance1: recall@1 of constant features.
+        chance5: recall@5 of constant features.
+        gallery: touches in a gallery.
+        queries: how many were scored.
+        groups: of the queries.
+        nearness: mean distance of the distractors to the true touch, over that of all candidates.
+        notes: what a reader should know.
+        per_query: the queries one by one; not in JSON.
     """
 
     name: str
@@ -95,14 +115,23 @@ def cross_sensor_retrieval(
     metrics: Mapping[str, Metric] | None = None,
     seeds: int = 5,
 ) -> list[Retrieval]:
-    """Return retrieval for each set of features, ordered pair of sensors and kind of centring;
-    pooled results last.
+    """Return retrieval for each set of features, pair of sensors and kind of centring.
 
-    `features` {name: (len(rows), d)} are those of manifest `rows`; the deepest frame of each touch,
-    sensor and unit is used. `match` names label columns, of which those in the manifest are used;
-    None draws random galleries. `metrics` {name: metric}, cosine by default. Raises UserError for a
-    single sensor, no covariate, no common touch, a gallery that is too large, or features that are
-    not finite.
+    Pooled results of all pairs come last.
+
+    Args:
+        manifest: with the columns touch and unit, and labels to match in.
+        features: {name: (len(rows), d)} of manifest `rows`.
+        rows: row numbers; the deepest frame of each touch, sensor and sensor instance is used.
+        gallery_size: touches in a gallery.
+        match: label columns, of which those in the manifest are used; None draws random galleries.
+        centre: whether the mean feature of each sensor is subtracted, each way once.
+        metrics: {name: metric}, cosine by default.
+        seeds: random galleries of each query.
+
+    Raises:
+        UserError: for a single sensor, no covariate, no common touch, a gallery that is too large,
+            or features that are not finite.
     """
     rows = np.asarray(rows)
     for name, values in features.items():
@@ -112,35 +141,24 @@ def cross_sensor_retrieval(
                 f"{len(rows)}."
             )
     used, place, covariates, notes = _usable(manifest, rows, match)
-    names = ("sensor", "unit", "object", "touch")
-    sensors, units, objects, touch = (manifest.text_column(name)[used] for name in names)
-    if len(manifest.files) > 1:
-        # equal names of joined manifests are not one touch
-        touch = _joined(touch, manifest.source[used])
-    unit = _joined(sensors, units)
-    groups = np.where(objects == "", touch, objects)
-    keys = _joined(touch, unit)
-    drawn = {}
-    rows_of = {str(name): np.flatnonzero(sensors == name) for name in np.unique(sensors)}
-    if len(rows_of) < 2:
-        raise UserError(
-            "Cross-sensor retrieval needs touches by two sensors. These are by "
-            f"{', '.join(rows_of)}."
-        )
-    for first, second in permutations(rows_of, 2):
-        query = rows_of[first]
-        gallery = rows_of[second]
-        if not np.isin(touch[query], touch[gallery]).any():
+    touches = _Touches.of(manifest, used)
+    drawn: dict[tuple[str, str], Galleries] = {}
+    for first, second in permutations(touches.rows_of, 2):
+        query = touches.rows_of[first]
+        gallery = touches.rows_of[second]
+        if not np.isin(touches.touch[query], touches.touch[gallery]).any():
             notes += (f"{first} to {second} left out: they share no touch",)
             continue
-        near = None if match is None else numbers(manifest, covariates, used[gallery])
+        near = None
+        if match is not None:
+            near = numbers(manifest, covariates, used[gallery])
         drawn[first, second] = draw_galleries(
-            touch[query],
-            touch[gallery],
+            touches.touch[query],
+            touches.touch[gallery],
             gallery_size=gallery_size,
             match=near,
-            query_unit=unit[query],
-            gallery_unit=unit[gallery],
+            query_unit=touches.unit[query],
+            gallery_unit=touches.unit[gallery],
             seeds=seeds,
         )
     if not drawn:
@@ -150,34 +168,79 @@ def cross_sensor_retrieval(
         )
     results = []
     for name, centred in product(features, centre):
-        metric = (metrics or {}).get(name, "cosine")
-        values = np.asarray(features[name])[place]
-        common = {
+        common: dict[str, Any] = {
             "name": name,
-            "metric": metric,
+            "metric": (metrics or {}).get(name, "cosine"),
             "matched": covariates,
             "centred": centred,
             "notes": notes,
         }
-        tables = []
-        for (first, second), galleries in drawn.items():
-            query = rows_of[first]
-            gallery = rows_of[second]
-            tops = score_galleries(
-                values[query], values[gallery], galleries, metric=metric, centre=centred
+        values = np.asarray(features[name])[place]
+        results += _scores_of(values, touches, drawn, gallery_size, common)
+    return results
+
+
+@dataclass(frozen=True, eq=False)
+class _Touches:
+    """Names of the touches that are used, text (n,), and the places of each sensor's."""
+
+    touch: Array
+    unit: Array
+    groups: Array
+    rows_of: dict[str, Array]
+
+    @staticmethod
+    def of(manifest: Manifest, used: Array) -> _Touches:
+        """Return the names of the rows `used`. Raises UserError for a single sensor."""
+        columns = ("sensor", "unit", "object", "touch")
+        sensors, units, objects, touch = (manifest.text_column(name)[used] for name in columns)
+        if len(manifest.files) > 1:
+            # equal names of joined manifests are not one touch
+            touch = _joined(touch, manifest.source[used])
+        rows_of = {str(name): np.flatnonzero(sensors == name) for name in np.unique(sensors)}
+        if len(rows_of) < 2:
+            raise UserError(
+                "Cross-sensor retrieval needs touches by two sensors. These are by "
+                f"{', '.join(rows_of)}."
             )
-            ids = query[galleries.queries]
-            tables.append(
-                QueryScores(
-                    _joined(keys[ids], [f"{first} to {second}"] * len(ids)), *tops, groups[ids]
-                )
-            )
-            sides = {"query_sensor": first, "gallery_sensor": second}
-            results.append(_summary(tables[-1], gallery_size, (galleries,), common | sides))
-        pooled = QueryScores(
-            *map(np.concatenate, zip(*(vars(table).values() for table in tables), strict=True))
+        groups = np.where(objects == "", touch, objects)
+        return _Touches(touch, _joined(sensors, units), groups, rows_of)
+
+
+def _scores_of(
+    values: Array,
+    touches: _Touches,
+    drawn: Mapping[tuple[str, str], Galleries],
+    size: int,
+    common: Mapping[str, Any],
+) -> list[Retrieval]:
+    """Return the results of one set of features: of each pair of sensors, then pooled."""
+    keys = _joined(touches.touch, touches.unit)
+    results = []
+    tables = []
+    for (first, second), galleries in drawn.items():
+        query = touches.rows_of[first]
+        gallery = touches.rows_of[second]
+        top1, top5 = score_galleries(
+            values[query],
+            values[gallery],
+            galleries,
+            metric=common["metric"],
+            centre=common["centred"],
         )
-        results.append(_summary(pooled, gallery_size, tuple(drawn.values()), common))
+        ids = query[galleries.queries]
+        own_keys = _joined(keys[ids], [f"{first} to {second}"] * len(ids))
+        table = QueryScores(own_keys, top1, top5, touches.groups[ids])
+        tables.append(table)
+        sides = {"query_sensor": first, "gallery_sensor": second}
+        results.append(_summary(table, size, (galleries,), {**common, **sides}))
+    pooled = QueryScores(
+        np.concatenate([table.keys for table in tables]),
+        np.concatenate([table.top1 for table in tables]),
+        np.concatenate([table.top5 for table in tables]),
+        np.concatenate([table.groups for table in tables]),
+    )
+    results.append(_summary(pooled, size, tuple(drawn.values()), common))
     return results
 
 
@@ -188,12 +251,13 @@ def difference(first: Retrieval, second: Retrieval) -> tuple[float, float | None
     """
     a = first.per_query
     b = second.per_query
-    if (
-        a is None
-        or b is None
-        or not np.array_equal(a.keys, b.keys)
-        or not np.array_equal(a.groups, b.groups)
-    ):
+    is_paired = (
+        a is not None
+        and b is not None
+        and np.array_equal(a.keys, b.keys)
+        and np.array_equal(a.groups, b.groups)
+    )
+    if a is None or b is None or not is_paired:
         raise UserError(
             f"{first.name!r} and {second.name!r} have different queries. Give both the same rows."
         )
@@ -204,19 +268,17 @@ def difference(first: Retrieval, second: Retrieval) -> tuple[float, float | None
 def _summary(
     scores: QueryScores, size: int, drawn: Sequence[Galleries], common: Mapping[str, Any]
 ) -> Retrieval:
+    """Return the result of some queries; `common` are the fields that do not depend on them."""
     missing = sum(galleries.missing for galleries in drawn)
     notes = tuple(common["notes"])
     if missing:
         notes += (f"{missing} queries left out: no other unit in the gallery has their touch",)
     near = [(part.nearness, len(part.queries)) for part in drawn if part.nearness is not None]
-    nearness = (
-        sum(value * count for value, count in near) / sum(count for _, count in near)
-        if near
-        else None
-    )
-    (low, high), (low5, high5) = (
-        mean_interval(top, scores.groups) for top in (scores.top1, scores.top5)
-    )
+    nearness = None
+    if near:
+        nearness = sum(value * count for value, count in near) / sum(count for _, count in near)
+    low, high = fraction_interval(scores.top1, scores.groups)
+    low5, high5 = fraction_interval(scores.top5, scores.groups)
     fields: dict[str, Any] = {
         "query_sensor": ALL,
         "gallery_sensor": ALL,
@@ -250,12 +312,9 @@ def _usable(
         notes.append(
             f"{int(is_field.sum())} touches by force-field sensors, which have no images, left out"
         )
-    covariates = (
-        ()
-        if match is None
-        else tuple(name for name in match if name in manifest.table.column_names)
-    )
+    covariates: tuple[str, ...] = ()
     if match is not None:
+        covariates = tuple(name for name in match if name in manifest.table.column_names)
         if not covariates:
             raise UserError(
                 f"The manifest has none of {', '.join(match)} to match the gallery in. Use "
@@ -271,7 +330,7 @@ def _usable(
     return used, order[np.searchsorted(rows, used, sorter=order)], covariates, tuple(notes)
 
 
-def _joined(first: Any, second: Any) -> Array:
+def _joined(first: Iterable[Any], second: Iterable[Any]) -> Array:
     return np.array([f"{a}/{b}" for a, b in zip(first, second, strict=True)], dtype=str)
 
 
@@ -279,9 +338,11 @@ def _joined(first: Any, second: Any) -> Array:
 class Galleries:
     """Gallery rows of each query, drawn from names and covariates alone.
 
-    `queries` (n,) row numbers. `items` (draws, n, size) gallery rows, the true touch first.
-    `nearness` as in `Retrieval`. `missing` counts queries whose touch no other unit in the gallery
-    has.
+    Attributes:
+        queries: row numbers (n,).
+        items: gallery rows (draws, n, size), the true touch first.
+        nearness: as in `Retrieval`.
+        missing: queries whose touch no other sensor instance in the gallery has.
     """
 
     queries: Array
@@ -291,21 +352,31 @@ class Galleries:
 
 
 def draw_galleries(
-    query_touch: Any,
-    gallery_touch: Any,
+    query_touch: npt.ArrayLike,
+    gallery_touch: npt.ArrayLike,
     *,
     gallery_size: int = GALLERY,
     match: Array | None = None,
-    query_unit: Any = None,
-    gallery_unit: Any = None,
+    query_unit: npt.ArrayLike | None = None,
+    gallery_unit: npt.ArrayLike | None = None,
     seeds: int = 5,
 ) -> Galleries:
     """Return galleries that depend on names, covariates and seeds, not on the order of rows.
 
-    Equal names are one touch. `match` (m, k) are covariates of the gallery, scaled to unit spread:
-    the nearest are the distractors. Without it `seeds` random galleries are drawn. Items of the
-    query's own unit are never in its gallery. Raises UserError for too few touches, or no common
-    touch.
+    So every set of features is scored on the same galleries, and differences are paired.
+
+    Args:
+        query_touch: names (q,); equal names are one touch.
+        gallery_touch: names (m,).
+        gallery_size: touches in a gallery.
+        match: covariates (m, k) of the gallery, scaled to unit spread: the nearest are the
+            distractors. Without it random galleries are drawn.
+        query_unit: sensor instances (q,). Items of the query's own are never in its gallery.
+        gallery_unit: sensor instances (m,).
+        seeds: how many random galleries each query has.
+
+    Raises:
+        UserError: for too few touches, or no common touch.
     """
     if seeds < 1:
         raise UserError(f"seeds must be at least 1, not {seeds}.")
@@ -313,13 +384,8 @@ def draw_galleries(
         raise UserError(
             f"gallery_size {gallery_size} is too small. A gallery has the touch and another."
         )
-    (query_order, query_touch, query_unit), (order, touch, unit) = (
-        _by_name(touches, [side] * len(touches) if units is None else units)
-        for side, touches, units in (
-            ("query", query_touch, query_unit),
-            ("gallery", gallery_touch, gallery_unit),
-        )
-    )
+    query_order, query_touch, query_unit = _by_name(query_touch, query_unit, "query")
+    order, touch, unit = _by_name(gallery_touch, gallery_unit, "gallery")
     for one, two in pairwise(zip(touch, unit, strict=True)):
         if one == two:
             raise UserError(
@@ -327,9 +393,11 @@ def draw_galleries(
                 "touch."
             )
     # matched galleries have no randomness
-    draws = seeds if match is None else 1
+    draws = 1
     covariates = np.zeros((len(order), 0))
-    if match is not None:
+    if match is None:
+        draws = seeds
+    else:
         spread = match.std(axis=0)
         covariates = ((match - match.mean(axis=0)) / np.where(spread > 0, spread, 1.0))[order]
     ranks = []
@@ -349,17 +417,21 @@ def draw_galleries(
                 "smaller --gallery."
             )
         ranks.append(rank)
-        several = [
-            _draw(own, rest, covariates, gallery_size, np.random.default_rng([s, rank]))
-            for s in range(draws)
-        ]
-        items.append([order[chosen] for chosen, _ in several])
-        sums += np.sum([distances for _, distances in several], axis=0)
+        chosen = []
+        for seed in range(draws):
+            # By the rank of the query among names: other queries do not change its gallery.
+            rng = np.random.default_rng([seed, rank])
+            drawn, distances = _draw(own, rest, covariates, gallery_size, rng)
+            chosen.append(order[drawn])
+            sums += distances
+        items.append(chosen)
     if not ranks:
         raise UserError("No query touch is in the gallery. The two sensors share no touch.")
     rows = query_order[ranks]
     back = np.argsort(rows)
-    nearness = float(sums[0] / sums[1]) if sums[1] > 0 else None
+    nearness = None
+    if sums[1] > 0:
+        nearness = float(sums[0] / sums[1])
     return Galleries(
         rows[back],
         np.asarray(items).transpose(1, 0, 2)[:, back],
@@ -368,9 +440,16 @@ def draw_galleries(
     )
 
 
-def _by_name(touches: Any, units: Any) -> tuple[Array, Array, Array]:
-    """Return an order of rows that depends on their names alone, and touch and unit names in it."""
+def _by_name(
+    touches: npt.ArrayLike, units: npt.ArrayLike | None, side: str
+) -> tuple[Array, Array, Array]:
+    """Return an order of rows that depends on their names alone, and touch and unit names in it.
+
+    Without units all rows of a `side` are of one, so that both sides never share one.
+    """
     touch = np.asarray(touches).astype(str)
+    if units is None:
+        units = [side] * len(touch)
     unit = np.asarray(units).astype(str)
     order = np.lexsort((unit, touch))
     return order, touch[order], unit[order]
@@ -379,17 +458,17 @@ def _by_name(touches: Any, units: Any) -> tuple[Array, Array, Array]:
 def _draw(
     own: Array, rest: Array, covariates: Array, size: int, rng: np.random.Generator
 ) -> tuple[Array, tuple[float, float]]:
-    """Return one gallery, the true touch first, and the mean distances of its distractors and of
-    all candidates.
+    """Return one gallery, the true touch first.
+
+    Then come the mean distances of its distractors and of all candidates.
     """
     wanted = own[rng.integers(len(own))]
+    # Without covariates all distances are 0, and the lot alone decides.
     lot = rng.random(len(rest))
     distance = np.linalg.norm(covariates[rest] - covariates[[wanted]], axis=1)
     nearest = np.lexsort((lot, distance))[: size - 1]
-    return np.concatenate([[wanted], rest[nearest]]), (
-        float(distance[nearest].mean()),
-        float(distance.mean()),
-    )
+    means = (float(distance[nearest].mean()), float(distance.mean()))
+    return np.concatenate([[wanted], rest[nearest]]), means
 
 
 def score_galleries(
@@ -400,11 +479,19 @@ def score_galleries(
     metric: Metric = "cosine",
     centre: bool = False,
 ) -> tuple[Array, Array]:
-    """Return recall@1 and recall@5 (n,) of each query as means over galleries; ties share their
-    ranks evenly.
+    """Return recall@1 and recall@5 (n,) of each query, as means over its galleries.
 
-    `query` (q, d), `gallery` (m, d). `centre` subtracts the mean of each side. UserError for values
-    that do not fit.
+    Ties share their ranks evenly: a query whose gallery is one tie has recall@1 of one in its size.
+
+    Args:
+        query: features (q, d).
+        gallery: features (m, d).
+        drawn: the galleries of n of the queries.
+        metric: by which touches are near.
+        centre: subtracts the mean of each side.
+
+    Raises:
+        UserError: for values that do not fit.
     """
     q = _finite(query, "query")
     g = _finite(gallery, "gallery")
@@ -420,7 +507,8 @@ def score_galleries(
         # distances.
         least = _TIE * max(np.abs(side).max(initial=0.0) for side in (q, g))
         middle = g.mean(axis=0, keepdims=True)
-        q, g = (np.where(np.abs(side - middle) > least, side - middle, 0.0) for side in (q, g))
+        q = np.where(np.abs(q - middle) > least, q - middle, 0.0)
+        g = np.where(np.abs(g - middle) > least, g - middle, 0.0)
         size = max(np.abs(side).max(initial=0.0) for side in (q, g)) or 1.0
         q = q / size
         g = g / size
@@ -430,28 +518,31 @@ def score_galleries(
         part = slice(start, start + _CHUNK)
         likeness = q[part] @ g.T
         if metric == "euclidean":
-            likeness = (
-                2 * likeness
-                - np.sum(g * g, axis=1)[None]
-                - np.sum(q[part] ** 2, axis=1, keepdims=True)
-            )
+            # minus the squared distance
+            gallery_square = np.sum(g * g, axis=1)[None]
+            query_square = np.sum(q[part] ** 2, axis=1, keepdims=True)
+            likeness = 2 * likeness - gallery_square - query_square
         for items in drawn.items[:, part]:
             values = np.take_along_axis(likeness, items, axis=1)
             margin = _TIE * np.maximum(1.0, np.abs(values).max(axis=1, keepdims=True))
             ahead = values[:, 1:] - values[:, :1]
             better = np.sum(ahead > margin, axis=1)
             equal = np.sum(np.abs(ahead) <= margin, axis=1)
+            # The true touch shares the ranks after the better ones with its equals: of these
+            # equal + 1 ranks k - better lie within the first k.
             for k, total in ((1, top1), (5, top5)):
                 total[part] += np.clip((k - better) / (equal + 1), 0, 1) / len(drawn.items)
     return top1, top5
 
 
 def _prepared(values: Array, metric: Metric, centre: bool) -> Array:
-    """Return rows to compare by their products; the rest of a constant after centring is 0, not
-    noise.
+    """Return rows to compare by their products.
+
+    What centring leaves of a constant is 0, not rounding noise, whose direction would decide.
     """
-    least = _TIE * np.abs(values).max(initial=0.0) if centre else 0.0
+    least = 0.0
     if centre:
+        least = _TIE * np.abs(values).max(initial=0.0)
         values = values - values.mean(axis=0, keepdims=True)
     if metric == "euclidean":
         return np.where(np.abs(values) > least, values, 0.0)
@@ -474,11 +565,18 @@ def _finite(values: Any, kind: str) -> Array:
 
 @dataclass(frozen=True)
 class MatchScore:
-    """How a matcher distinguishes positives from `negatives`; shares are in 0..1, chance is 0.5.
+    """How a matcher distinguishes positives from `negatives`; chance is 0.5.
 
-    `accuracy`: share of logits on the right side of 0. `low`, `high`: its 95 % interval under a
-    bootstrap over the anchors' objects, None with fewer than two. `sensors_alone`: accuracy of the
-    best rule that only knows the two sensors.
+    Attributes:
+        negatives: of any sensor, or of the positive's.
+        accuracy: fraction of logits on the right side of 0.
+        low: lower end of its 95 % interval under a bootstrap over the anchors' objects, None with
+            fewer than two.
+        high: its upper end.
+        auc: area under the ROC curve of the logits.
+        sensors_alone: accuracy of the best rule that only knows the two sensors.
+        triples: anchor, positive and negative.
+        anchors: how many there are.
     """
 
     negatives: Negatives
@@ -494,12 +592,19 @@ class MatchScore:
 def score_matching(
     encoder: Encoder, manifest: Manifest, rows: Array, features: Array
 ) -> list[MatchScore]:
-    """Return the scores of the encoder's matching head (Eq. 5) with negatives of any sensor, and of
-    the positive's.
+    """Return the scores of the encoder's matching head (Eq. 5) for both kinds of negatives.
 
-    With negatives of any sensor, the sensors alone reveal part of the answer. `features` (n, E) are
-    those of manifest `rows` (n,), pooling class. Raises UserError without a matching head, and if
-    two sensors share no touch.
+    With negatives of any sensor, the sensors alone reveal part of the answer. With negatives of the
+    positive's sensor they do not.
+
+    Args:
+        encoder: with a matching head.
+        manifest: whose column touch says which touches match.
+        rows: row numbers (n,).
+        features: (n, E) of these, pooling class.
+
+    Raises:
+        UserError: without a matching head, and if two sensors share no touch.
     """
     objects = manifest.text_column("object")[rows]
     scores = []
@@ -513,7 +618,7 @@ def score_matching(
         codes = [
             sensor[anchor] * (1 + sensor.max()) + sensor[other] for other in (positive, negative)
         ]
-        low, high = mean_interval(correct, objects[anchor])
+        low, high = fraction_interval(correct, objects[anchor])
         labels = np.repeat([1, 0], [len(right), len(wrong)])
         auc = float(roc_auc_score(labels, np.concatenate([right, wrong])))
         alone = best_rule(codes[0], codes[1], anchor)
@@ -539,11 +644,11 @@ def draw_triples(
         raise UserError(
             f"two sensors share no touch{which} in these rows; there is nothing to match"
         )
-    triples = [
-        (int(anchor), *matches.draw(int(anchor), np.random.default_rng([seed, int(anchor), turn])))
-        for anchor in matches.anchors
-        for turn in range(draws)
-    ]
+    triples = []
+    for one in map(int, matches.anchors):
+        for number in range(draws):
+            drawn = matches.draw(one, np.random.default_rng([seed, one, number]))
+            triples.append((one, *drawn))
     anchor, positive, negative = np.asarray(triples, np.int64).T
     return anchor, positive, negative
 
@@ -561,7 +666,9 @@ def best_rule(right: Array, wrong: Array, anchor: Array) -> float:
     yes = np.empty((2, len(place)))
     for side in (0, 1):
         counts = [np.bincount(part[half != side], minlength=len(codes)) for part in code]
-        yes[:, half == side] = (0.5 + 0.5 * np.sign(counts[0] - counts[1]))[code[:, half == side]]
+        # 1 where the code was a positive more often, 0 where a negative, 0.5 where it is unknown
+        rule = 0.5 + 0.5 * np.sign(counts[0] - counts[1])
+        yes[:, half == side] = rule[code[:, half == side]]
     return float((yes[0].mean() + 1 - yes[1].mean()) / 2)
 
 
@@ -576,12 +683,19 @@ def numbers(manifest: Manifest, names: Sequence[str], rows: Array) -> Array:
 def deepest_rows(
     manifest: Manifest, rows: Array | None = None, *, split: str = "test", frames: int = 1
 ) -> Array:
-    """Return one row for each touch, sensor and unit, in order: that of the largest `label.force`,
-    the first of equals.
+    """Return one row for each touch, sensor and sensor instance, in order: the deepest.
 
-    Only `rows` are used, the whole `split` by default; with `frames` > 1 only ends of clips of so
-    many. Without forces the largest `label.depth` is used, without both the middle frame. Raises
-    UserError if no row is left.
+    That is the row of the largest `label.force`, the first of equals. Without forces it is that of
+    the largest `label.depth`, without both the middle frame.
+
+    Args:
+        manifest: with the column touch.
+        rows: those that are used, the whole `split` by default.
+        split: of the manifest.
+        frames: above 1 only ends of clips of so many frames are used.
+
+    Raises:
+        UserError: if no row is left.
     """
     rows = np.unique(manifest.rows_of(split) if rows is None else np.asarray(rows))
     rows = rows[manifest.present("touch")[rows]]
@@ -607,12 +721,11 @@ def deepest_rows(
 
 
 def _depth(manifest: Manifest, rows: Array, contact: Array) -> Array:
-    """Return the depth of each row (n,) within its contact, by the best column that its file
-    has.
-    """
+    """Return the depth of each row (n,) within its contact, by the best column of its file."""
     frame = np.asarray(manifest.column("frame_index"))[rows].astype(np.float64)
     middle = np.array([np.median(frame[contact == number]) for number in range(contact.max() + 1)])
     depth = -np.abs(frame - middle[contact])
+    # In this order, so that force, where a file has it, replaces depth.
     for name in ("label.depth", "label.force"):
         if name in manifest.table.column_names:
             values = numbers(manifest, (name,), rows)[:, 0]
@@ -623,11 +736,11 @@ def _depth(manifest: Manifest, rows: Array, contact: Array) -> Array:
 
 
 def contact_vector(manifest: Manifest, rows: Array) -> Array:
-    """Return area, centroid and force of each contact, as far as the manifest has them, f32 (rows,
-    up to 4).
+    """Return area, centroid and force of each contact, f32 (rows, up to 4).
 
-    Each has mean 0 and spread 1 within its sensor. Raises UserError if the manifest or a row lacks
-    them.
+    They are a control: what retrieval owes to where and how hard a touch was, without its texture.
+    Each has mean 0 and standard deviation 1 within its sensor. Raises UserError if the manifest or
+    a row lacks them.
     """
     names = [name for name in VECTOR if name in manifest.table.column_names]
     if not names:
@@ -645,7 +758,6 @@ def contact_vector(manifest: Manifest, rows: Array) -> Array:
     for sensor in np.unique(sensors):
         part = values[sensors == sensor]
         spread = part.std(axis=0, keepdims=True)
-        values[sensors == sensor] = (part - part.mean(axis=0, keepdims=True)) / np.where(
-            spread > 0, spread, 1.0
-        )
+        centred = part - part.mean(axis=0, keepdims=True)
+        values[sensors == sensor] = centred / np.where(spread > 0, spread, 1.0)
     return values.astype(np.float32)

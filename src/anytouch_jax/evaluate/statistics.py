@@ -1,48 +1,81 @@
-"""Statistics of evaluations: bootstrap intervals over groups and seeds, verdicts, Markdown tables,
-plain JSON.
+"""Statistics of evaluations: scores with 95 % intervals from bootstraps over groups and seeds.
+
+A group is what was sampled independently: a recording, an object, a touch. Frames of one recording
+are nearly equal, so a bootstrap over frames would give intervals that are far too narrow.
 """
 
-import dataclasses
+from __future__ import annotations
+
 import functools
-import re
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from scipy.stats import rankdata
 
 Array = npt.NDArray[Any]
 Protocol = Literal["honest", "published"]
+Interval = tuple[float | None, float | None]
+# sums (..., k) over rows -> a score (...)
+Metric = Callable[[Array], Array]
+
 # the controls of probes
 RAW = "raw pixels"
 RANDOM = "random encoder"
 
-# bootstraps of an interval: its ends are 0.03 standard errors off, with a tenth of the draws 0.09
+# Bootstraps of an interval. Its ends are 0.03 standard errors off; a tenth of the draws gives 0.09.
 DRAWS = 10_000
+# Draws that are made and kept at once: 1000 x 5000 groups are 5 MB of counts.
+_BLOCK = 1000
+_MOST_KEPT = 5000
 
 
 class GroupSums(NamedTuple):
-    """Test rows of one run: `groups` (n,), and what is summed over them, f64 (n, sums)."""
+    """Test rows of one run: `groups` (n,), and what is summed over them, f64 (n, sums).
+
+    A score is a function of these sums over all rows, so a bootstrap only has to weight groups.
+    """
 
     groups: Array
     sums: Array
 
 
 def classification_sums(correct: Array, groups: Array) -> GroupSums:
-    """Return the sums that `_mean_of` divides, of values (n,) or of rows that are right or
-    wrong.
-    """
-    return GroupSums(groups, np.stack([np.asarray(correct, np.float64), np.ones(len(correct))], 1))
+    """Return the sums of `_mean_of` for values (n,), or for rows that are right or wrong."""
+    values = np.asarray(correct, np.float64)
+    return GroupSums(groups, np.stack([values, np.ones(len(correct))], axis=1))
 
 
-def regression_sums(error: Array, truth: Array, groups: Array) -> GroupSums:
-    """Return what `_r2_of` and `_mae_of` divide; `truth` is best centred: the square of an offset
-    hides the spread.
+def regression_sums(
+    error: Array, truth: Array, groups: Array, predicted: Array | None = None
+) -> GroupSums:
+    """Return the sums of `_r2_of`, `_mae_of` and `_spearman_of`.
+
+    Args:
+        error: (n,) of the predictions.
+        truth: (n,), best centred, because the square of an offset hides the spread.
+        groups: (n,).
+        predicted: (n,), whose ranks count; by default the truth plus the error.
     """
-    return GroupSums(
-        groups, np.stack([error**2, np.abs(error), truth, truth**2, np.ones(len(error))], 1)
-    )
+    if predicted is None:
+        predicted = truth + error
+    # Ranks among all rows, once: ranks of every draw would cost a sort each, and differ little.
+    own_rank = rankdata(predicted) / len(error) - 0.5
+    true_rank = rankdata(truth) / len(error) - 0.5
+    columns = [
+        error**2,
+        np.abs(error),
+        truth,
+        truth**2,
+        np.ones(len(error)),
+        own_rank,
+        true_rank,
+        own_rank**2,
+        true_rank**2,
+        own_rank * true_rank,
+    ]
+    return GroupSums(groups, np.stack(columns, axis=1))
 
 
 def _mean_of(sums: Array) -> Array:
@@ -51,11 +84,13 @@ def _mean_of(sums: Array) -> Array:
 
 
 def _r2_of(sums: Array) -> Array:
-    """Return R2 from sums (..., [squared error, absolute error, truth, squared truth, rows]); NaN
-    for equal labels.
+    """Return R2, NaN for equal labels.
+
+    The sums are (..., [squared error, absolute error, truth, squared truth, rows]).
     """
     spread = sums[..., 3] - sums[..., 2] ** 2 / sums[..., 4]
-    return np.asarray(1 - sums[..., 0] / np.where(spread > 1e-12 * sums[..., 3], spread, np.nan))
+    has_spread = spread > 1e-12 * sums[..., 3]
+    return np.asarray(1 - sums[..., 0] / np.where(has_spread, spread, np.nan))
 
 
 def _mae_of(sums: Array) -> Array:
@@ -63,33 +98,48 @@ def _mae_of(sums: Array) -> Array:
     return np.asarray(sums[..., 1] / sums[..., 4])
 
 
+def _spearman_of(sums: Array) -> Array:
+    """Return Spearman's rank correlation, NaN for equal labels or equal predictions.
+
+    The sums from the fifth on are (..., [rows, rank, true rank, squares of both, product]).
+    """
+    rows = sums[..., 4]
+    own = sums[..., 7] - sums[..., 5] ** 2 / rows
+    true = sums[..., 8] - sums[..., 6] ** 2 / rows
+    both = sums[..., 9] - sums[..., 5] * sums[..., 6] / rows
+    has_spread = (own > 1e-9) & (true > 1e-9)
+    return np.asarray(both / np.sqrt(np.where(has_spread, own * true, np.nan)))
+
+
+def _metric(measured: bool) -> Metric:
+    if measured:
+        return _r2_of
+    return _mean_of
+
+
 def paired_gain(
     real: Sequence[GroupSums], other: Sequence[GroupSums], measured: bool
 ) -> dict[str, float | None]:
-    """Return by how much the score of `real` is above that of `other` on the same rows, with its 95
-    % interval.
+    """Return by how much the score of `real` is above that of `other`, with its 95 % interval.
+
+    Both are scored on the same rows, and every draw takes the same groups for both. What makes a
+    group hard for both cancels, so this interval is narrower than the two separate ones suggest.
     """
-    metric = _r2_of if measured else _mean_of
+    metric = _metric(measured)
     width = real[0].sums.shape[1]
 
     def gain(sums: Array) -> Array:
         return metric(sums[..., :width]) - metric(sums[..., width:])
 
-    both = [
-        GroupSums(a.groups, np.concatenate([a.sums, b.sums], 1))
-        for a, b in zip(real, other, strict=True)
-    ]
+    both = []
+    for a, b in zip(real, other, strict=True):
+        both.append(GroupSums(a.groups, np.concatenate([a.sums, b.sums], axis=1)))
     low, high = _bootstrap_interval(both, gain)
-    return {
-        "difference": float(np.mean([gain(run.sums.sum(0)) for run in both])),
-        "low": low,
-        "high": high,
-    }
+    difference = float(np.mean([gain(run.sums.sum(0)) for run in both]))
+    return {"difference": difference, "low": low, "high": high}
 
 
-def _bootstrap_interval(
-    runs: Sequence[GroupSums], of: Callable[[Array], Array]
-) -> tuple[float | None, float | None]:
+def _bootstrap_interval(runs: Sequence[GroupSums], of: Metric) -> Interval:
     """Return the 95 % percentile interval of the mean over runs of `of` (sums -> number).
 
     Groups, which all runs share, and runs are resampled. (None, None) with fewer than two groups,
@@ -98,54 +148,89 @@ def _bootstrap_interval(
     names = np.unique(np.concatenate([run.groups for run in runs]))
     if len(names) < 2:
         return None, None
+    # Sums of each group once: a draw is then a product with how often each group came.
     totals = np.zeros((len(runs), len(names), runs[0].sums.shape[1]))
     for total, run in zip(totals, runs, strict=True):
         np.add.at(total, np.searchsorted(names, run.groups), run.sums)
-    # the draws of many groups are not kept
-    draw = _draws if len(names) <= 5000 else _draws.__wrapped__
-    shares = np.concatenate(_draws(len(runs), stream=1)) / len(runs)
+    draw: Callable[[int, int], list[Array]] = _draws
+    if len(names) > _MOST_KEPT:
+        draw = _draws.__wrapped__
+    # Seeds differ by their splits and fits, which is noise too. They are drawn from a stream of
+    # their own: drawn alike, seed k and group k would always come together.
+    run_weights = np.concatenate(_draws(len(runs), stream=1)) / len(runs)
     with np.errstate(divide="ignore", invalid="ignore"):
-        values = np.concatenate(
-            [[of(times @ total) for total in totals] for times in draw(len(names), 0)], axis=1
-        ).T
-    means = np.where(shares > 0, shares * values, 0).sum(1)
+        blocks = [[of(times @ total) for total in totals] for times in draw(len(names), 0)]
+        values: Array = np.concatenate(blocks, axis=1).T
+    # A run that was not drawn must not spoil the mean by its NaN.
+    means = np.where(run_weights > 0, run_weights * values, 0).sum(axis=1)
     means = means[np.isfinite(means)]
-    if means.size:
-        return tuple(np.percentile(means, [2.5, 97.5]).tolist())
-    return (None, None)
+    if not means.size:
+        return None, None
+    low, high = np.percentile(means, [2.5, 97.5]).tolist()
+    return low, high
 
 
 @functools.lru_cache(maxsize=4)  # drawing takes nine tenths of the time of an interval
 def _draws(count: int, stream: int) -> list[Array]:
-    """Return how often each of `count` groups is drawn, u8 (1000, count) at a time, DRAWS in all;
-    streams differ.
+    """Return how often each of `count` groups is drawn, u8 (1000, count) at a time, DRAWS in all.
+
+    Streams differ. The same groups are drawn for every score of equally many groups, so tables of
+    one test set are compared on the same draws.
     """
     rng = np.random.default_rng(stream)
-    shares = np.full(count, 1 / count)
-    return [
-        rng.multinomial(count, shares, size=1000).astype(np.uint8) for _ in range(DRAWS // 1000)
-    ]
+    chances = np.full(count, 1 / count)
+    blocks = []
+    for _ in range(DRAWS // _BLOCK):
+        blocks.append(rng.multinomial(count, chances, size=_BLOCK).astype(np.uint8))
+    return blocks
 
 
-def mean_interval(values: Array, groups: Array) -> tuple[float | None, float | None]:
-    """Return the 95 % percentile interval of the mean of `values` (n,) under a bootstrap over
-    `groups` (n,).
+def fraction_interval(values: Array, groups: Array) -> Interval:
+    """Return the 95 % interval of a fraction, the mean of `values` (n,) in 0..1.
+
+    It is the bootstrap over `groups` (n,). Where every group has the same value, 0 or 1, each draw
+    has it too, and the interval would be a point: sixty recordings that are all right would promise
+    100.0 to 100.0 %. There it is the exact one of Clopper and Pearson (1934), a group a trial.
+
+    Use it for accuracies and recalls. A difference has `paired_gain` or `mean_interval`.
     """
+    return _fraction_interval([classification_sums(values, groups)])
+
+
+def _fraction_interval(runs: Sequence[GroupSums]) -> Interval:
+    """Return the interval of `fraction_interval` for several runs, the seeds of a probe."""
+    low, high = _bootstrap_interval(runs, _mean_of)
+    if low is None or low != high or low not in (0.0, 1.0):
+        return low, high
+    groups = len(np.unique(np.concatenate([run.groups for run in runs])))
+    # All groups right: the fraction is above p, unless 2.5 % of p ** groups happened. Runs test the
+    # same groups, so more of them are no more trials.
+    least = 0.025 ** (1 / groups)
+    if low == 1.0:
+        return least, 1.0
+    return 0.0, 1.0 - least
+
+
+def mean_interval(values: Array, groups: Array) -> Interval:
+    """Return the 95 % interval of the mean of `values` (n,), by a bootstrap over `groups` (n,)."""
     return _bootstrap_interval([classification_sums(values, groups)], _mean_of)
 
 
 def scores(
     runs: Sequence[GroupSums], baselines: Sequence[GroupSums], measured: bool
 ) -> dict[str, Any]:
-    """Return mean, interval, values and chance of accuracy (R2 and MAE if `measured`), a run for
-    each seed.
+    """Return mean, interval, values and chance of accuracy.
+
+    If `measured` they are of R2, with the mean absolute error and Spearman's correlation beside it.
+
+    There is a run, and a baseline that predicts a constant, for each seed.
     """
 
-    def values(of: Callable[[Array], Array], several: Sequence[GroupSums]) -> list[float]:
+    def values(of: Metric, several: Sequence[GroupSums]) -> list[float]:
         return [float(of(run.sums.sum(0))) for run in several]
 
-    metric = _r2_of if measured else _mean_of
-    low, high = _bootstrap_interval(runs, metric)
+    metric = _metric(measured)
+    low, high = _bootstrap_interval(runs, metric) if measured else _fraction_interval(runs)
     result: dict[str, Any] = {
         "metric": "r2" if measured else "accuracy",
         "mean": float(np.mean(values(metric, runs))),
@@ -156,121 +241,15 @@ def scores(
     }
     if measured:
         mae_low, mae_high = _bootstrap_interval(runs, _mae_of)
-        mae, chance = (float(np.mean(values(_mae_of, several))) for several in (runs, baselines))
-        result |= {"mae": mae, "mae_low": mae_low, "mae_high": mae_high, "chance_mae": chance}
-    return result
-
-
-def plain(value: Any) -> Any:
-    """Return a value for JSON: records as objects without their values per row, numbers that are
-    not finite as null.
-    """
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        fields = dataclasses.fields(value)
-        return {
-            one.name: plain(getattr(value, one.name))
-            for one in fields
-            if one.name not in ("outcome", "per_query")
+        rank_low, rank_high = _bootstrap_interval(runs, _spearman_of)
+        rank = float(np.mean(values(_spearman_of, runs)))
+        result |= {
+            "mae": float(np.mean(values(_mae_of, runs))),
+            "mae_low": mae_low,
+            "mae_high": mae_high,
+            "chance_mae": float(np.mean(values(_mae_of, baselines))),
+            "spearman": rank if np.isfinite(rank) else None,
+            "spearman_low": rank_low,
+            "spearman_high": rank_high,
         }
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple | np.ndarray):
-        return [plain(item) for item in value]
-    value = value.item() if isinstance(value, np.generic) else value
-    if isinstance(value, Path):
-        return str(value)
-    if isinstance(value, float) and not np.isfinite(value):
-        return None
-    return value
-
-
-def markdown_table(header: Sequence[str], rows: Sequence[Sequence[Any]], align: str = "") -> str:
-    """Return a Markdown table; use it wherever a page, a report or a command prints one.
-
-    Cells are converted to text; bars, line breaks, HTML and links in them are escaped. `align` has
-    a letter per column, l or r for left or right; without it the reader's program decides.
-
-    >>> print(markdown_table(("sensor", "recall@1"), [("digit", 0.5)], "lr"))
-    | sensor | recall@1 |
-    | :--- | ---: |
-    | digit | 0.5 |
-    """
-    marks = {"l": ":---", "r": "---:"}
-    rule = [marks[letter] for letter in align] if align else ["---"] * len(header)
-    lines = [
-        [without_html(cell).replace("|", "\\|") for cell in line] for line in (header, rule, *rows)
-    ]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
-
-
-def without_html(value: Any) -> str:
-    """Return one line of Markdown without HTML, links and attributes of elements, whatever the
-    value says.
-    """
-    text = re.sub(r"&(?=#?\w+;)", "&amp;", " ".join(str(value).split()))
-    return re.sub(r"<(?=[A-Za-z/!?])", "&lt;", text).replace("](", "]\\(").replace("{", "&#123;")
-
-
-def as_text(value: Any) -> str:
-    """Return one line of Markdown that a reader sees as the value is written: for names and
-    captions of a user.
-    """
-    return re.sub(
-        r"[\\`*\[\]~]|(?<![^\W_])_|_(?![^\W_])",
-        r"\\\g<0>",
-        without_html(value).replace("]\\(", "]("),
-    )
-
-
-def verdict(name: str, gain: Mapping[str, float | None], task: str = "") -> str:
-    """Return a sentence on features against raw pixels, from a `paired_gain`."""
-    points, low, high = (100 * (gain[key] or 0.0) for key in ("difference", "low", "high"))
-    of = f"{task}: " if task else ""
-    if gain["low"] is None:
-        return (
-            f"{of}{name} is {points:+.0f} points from raw pixels, by too few test recordings to be "
-            "sure."
-        )
-    interval = f"({low:.0f} to {high:.0f})"
-    if low > 0:
-        return f"{of}{name} is {points:.0f} points above raw pixels {interval}."
-    return (
-        f"{of}{name} is no better than raw pixels: {points:+.0f} points {interval}. Try --pooling "
-        "both, more "
-        "recordings, or another encoder, and look at the untouched gel with `anytouch view`."
-    )
-
-
-def label_verdicts(results: Sequence[Any]) -> list[str]:
-    """Return a sentence on each source of features of `probe_label` against raw pixels, by its
-    first head.
-    """
-    first: dict[str, Any] = {}
-    for result in results:
-        first.setdefault(result.probe.partition(": ")[0], result)
-    sums = {
-        name: classification_sums(one.outcome.correct, one.outcome.groups)
-        for name, one in first.items()
-        if one.outcome is not None and ": " in one.probe
-    }
-    raw = sums.pop(RAW, None)
-    sums.pop(RANDOM, None)
-    if raw is None:
-        return []
-    return [verdict(name, paired_gain([one], [raw], False)) for name, one in sums.items()]
-
-
-def share_text(value: float | None) -> str:
-    """Return a share in percent as text, "-" if there is none."""
-    if value is None or np.isnan(value):
-        return "-"
-    return f"{100 * value:.1f} %"
-
-
-def interval_text(
-    low: float | None, high: float | None, factor: float = 100.0, digits: int = 1
-) -> str:
-    """Return an interval as text, "-" if there is none; shares are in points by default."""
-    if low is None or high is None:
-        return "-"
-    return f"{factor * low:.{digits}f} to {factor * high:.{digits}f}"
+    return result

@@ -1,8 +1,7 @@
-"""Probing tasks: which rows of a manifest, which label, which groups never stand on both sides of a
-split.
+"""Probing tasks: which rows of a manifest, which label, and which groups stay together.
 
-Probes read every frame unflipped, as a flip changes a direction label. Pre-training flips touches
-(`data.flip`).
+Probes read every frame unflipped, because a flip changes a direction label. Pre-training flips
+touches (`data.flip`).
 """
 
 from __future__ import annotations
@@ -25,6 +24,8 @@ from anytouch_jax.evaluate.statistics import Array
 
 T = TypeVar("T")
 Which = Literal["all", "press", "contact", "moving"]
+# whether a label is continuous: decided by its column, or given
+Regression = Literal["auto", "yes", "no"]
 
 # newtons (simulated) and label.contact_score (real_touch) above which a frame is contact
 FORCE = 0.05
@@ -37,14 +38,22 @@ GROUPS = ("grasp_group", "object", "touch")
 class Task:
     """A question to ask of frozen features.
 
-    `label`: a column of the manifest. `classes`: the only values that take part. `above`: the label
-    is a number, and the class is whether it is larger. `groups`: columns of which the first with a
-    value names the group of a row, else its sequence. The group "recording" is the sequence without
-    its last part. `frames`: 1, or the length of a clip that ends at the row. `which` rows: the
-    deepest frame of a recording ("press"), all that touch ("contact"), or the frame that slips most
-    ("moving"). `fingers`: rows of a touch by two units. `phase` "after" the grasp (Feel). `where`:
-    (column, text) must be equal, (column, number) must be exceeded. `test_list`: test rows are
-    those whose `downstream_test` names this list.
+    Attributes:
+        name: on the command line and in tables.
+        label: a column of the manifest.
+        kind: classes, or a continuous label ("regression").
+        groups: columns of which the first with a value names the group of a row, else its
+            sequence. The group "recording" is the sequence without its last part.
+        frames: 1, or the length of a clip that ends at the row.
+        which: the deepest frame of a recording ("press"), all that touch ("contact"), the frame
+            that slips most ("moving"), or all rows.
+        classes: the only values that take part.
+        above: the label is a number, and the class is whether it is larger.
+        fingers: rows of a touch by two sensor instances.
+        phase: "after" the grasp (Feel).
+        where: (column, text) must be equal, (column, number) must be exceeded.
+        test_list: test rows are those whose `downstream_test` names this list.
+        unit: of a continuous label.
     """
 
     name: str
@@ -92,8 +101,9 @@ TASKS = {
 
 @dataclass(frozen=True)
 class Benchmark:
-    """A public benchmark of the paper with the authors' settings; `paper`: the accuracy of AnyTouch
-    there.
+    """A public benchmark of the paper with the authors' settings.
+
+    `paper` is the accuracy of AnyTouch there, 0..1.
     """
 
     task: Task
@@ -103,75 +113,61 @@ class Benchmark:
     paper: float
 
 
-def _benchmark(
-    name: str,
-    dataset: str,
-    label: str,
-    paper: float,
-    batch: int,
-    rate: float,
-    decay: float,
-    pooling: Pooling = "class",
-    universal: bool = False,
-    **task: Any,
-) -> Benchmark:
-    question = Task(name, label, which="all", where=(("dataset", dataset),), **task)
-    return Benchmark(
-        question, pooling, GradientRecipe(batch=batch, rate=rate, decay=decay), universal, paper
-    )
+def _benchmark(dataset: str, task: Task, paper: float, **settings: Any) -> Benchmark:
+    """Return a benchmark on rows of one data set; `settings` are others than the usual ones."""
+    task = replace(task, which="all", where=(("dataset", dataset),))
+    usual: dict[str, Any] = {"pooling": "class", "universal": False}
+    return Benchmark(task, paper=paper, **usual | settings)
 
 
 # Paper, appendix "Downstream Datasets" and Tables 1 to 3; released code,
 # run_probe_{TAG,Feel,OF1,OF2}.sh, main_probe.py and downstream_dataset.py. A batch is of two
 # devices together. Features are computed once, so training pictures are not augmented: the release
 # flips and jitters them, except for ObjectFolder 2.0.
-_TAG: dict[str, Any] = {"batch": 128, "rate": 2e-4, "decay": 0.05, "groups": ("recording",)}
-_OF: dict[str, Any] = {"label": "label.material", "rate": 1e-3, "decay": 0.01, "universal": True}
-BENCHMARKS = {
-    benchmark.task.name: benchmark
-    for benchmark in (
-        _benchmark(
-            "touch_and_go_material",
-            "touch_and_go",
-            "label.material",
-            0.8082,
-            test_list="material",
-            **_TAG,
-        ),
-        _benchmark(
-            "touch_and_go_roughness",
-            "touch_and_go",
-            "label.rough",
-            0.8674,
-            test_list="rough",
-            **_TAG,
-        ),
-        _benchmark(
-            "touch_and_go_hardness",
-            "touch_and_go",
-            "label.hardness",
-            0.9468,
-            test_list="material",
-            **_TAG,
-        ),
-        _benchmark("feel_grasp", "feel", "label.success", 0.8053, 256, 1e-3, 0.05, fingers=True),
-        _benchmark(
-            "objectfolder1_material",
-            "objectfolder1",
-            paper=0.4962,
-            batch=128,
-            pooling="mean",
-            **_OF,
-        ),
-        _benchmark("objectfolder2_material", "objectfolder2", paper=0.7602, batch=256, **_OF),
-    )
-}
+_TAG = GradientRecipe(batch=128, rate=2e-4, decay=0.05)
+_FEEL = GradientRecipe(batch=256, rate=1e-3, decay=0.05)
+_OF1 = GradientRecipe(batch=128, rate=1e-3, decay=0.01)
+_OF2 = GradientRecipe(batch=256, rate=1e-3, decay=0.01)
+
+
+def _tag_task(name: str, label: str, test_list: str) -> Task:
+    """Return a task of Touch and Go; the authors' list says which rows are tested."""
+    return Task(f"touch_and_go_{name}", label, groups=("recording",), test_list=test_list)
+
+
+_BENCHMARKS = (
+    _benchmark(
+        "touch_and_go", _tag_task("material", "label.material", "material"), 0.8082, recipe=_TAG
+    ),
+    _benchmark("touch_and_go", _tag_task("roughness", "label.rough", "rough"), 0.8674, recipe=_TAG),
+    _benchmark(
+        "touch_and_go", _tag_task("hardness", "label.hardness", "material"), 0.9468, recipe=_TAG
+    ),
+    _benchmark("feel", Task("feel_grasp", "label.success", fingers=True), 0.8053, recipe=_FEEL),
+    _benchmark(
+        "objectfolder1",
+        Task("objectfolder1_material", "label.material"),
+        0.4962,
+        recipe=_OF1,
+        pooling="mean",
+        universal=True,
+    ),
+    _benchmark(
+        "objectfolder2",
+        Task("objectfolder2_material", "label.material"),
+        0.7602,
+        recipe=_OF2,
+        universal=True,
+    ),
+)
+BENCHMARKS = {benchmark.task.name: benchmark for benchmark in _BENCHMARKS}
 
 
 class TaskRows(NamedTuple):
-    """The rows of a task: `rows` i64 (n, fingers) of the manifest, and for each its label (text, or
-    f64 of a regression), group, split (train, val, test), sensor and unit. `notes` say which rows
-    are left out.
+    """The rows of a task, `rows` i64 (n, fingers) of the manifest, with what a probe knows of them.
+
+    `labels` (n,) are text, or f64 of a regression. `groups`, `split` (train, val, test), `sensors`
+    and `units` (sensor instances) are text (n,). `notes` say which rows are left out.
     """
 
     rows: Array
@@ -213,29 +209,73 @@ def label_task(
     where: tuple[str, float] | None = None,
     sensor: str | None = None,
 ) -> Task:
-    """Return the task of any label column ("label." may be left out), on all rows that pass the
-    filters.
+    """Return the task of any label column, on all rows that pass the filters.
 
-    `group` defaults to the first of GROUPS with a value that is not the label. UserError for an
-    unknown name.
+    Args:
+        table: the manifest.
+        label: the column; "label." may be left out.
+        group: column whose values stay together, by default the first of GROUPS with a value that
+            is not the label.
+        where: keep rows whose column is above a number.
+        sensor: keep rows of this sensor.
+
+    Raises:
+        UserError: for a name that the manifest does not have.
     """
-    conditions: list[tuple[str, str | float]] = (
-        [(find_column(table, where[0]), where[1])] if where else []
-    )
+    conditions: list[tuple[str, str | float]] = []
+    if where is not None:
+        column, number = where
+        conditions.append((find_column(table, column), number))
     if sensor is not None:
-        if sensor not in (known := sorted(set(table.text_column("sensor")))):
+        known = sorted(set(table.text_column("sensor")))
+        if sensor not in known:
             raise UserError(f"No row is of sensor {sensor!r}. The manifest has {', '.join(known)}.")
         conditions.append(("sensor", sensor))
     name = label.removeprefix("label.")
-    known = [
-        one
-        for one in GROUPS
-        if one != name and (_has_values(table, one) or _has_values(table, f"label.{one}"))
-    ]
-    groups = tuple(find_column(table, column) for column in ([group] if group else known[:1]))
-    return Task(
-        name, find_column(table, label), groups=groups, which="all", where=tuple(conditions)
-    )
+    columns = [group] if group else _group_columns(table, name)[:1]
+    groups = tuple(find_column(table, column) for column in columns)
+    column = find_column(table, label)
+    return Task(name, column, groups=groups, which="all", where=tuple(conditions))
+
+
+def _group_columns(table: Manifest, label: str) -> list[str]:
+    """Return those of GROUPS that have a value and are not the label itself.
+
+    Groups by the label would put each class on one side of the split.
+    """
+    columns = []
+    for name in GROUPS:
+        if name != label and (_has_values(table, name) or _has_values(table, f"label.{name}")):
+            columns.append(name)
+    return columns
+
+
+def with_kind(table: Manifest, task: Task, regression: Regression = "auto") -> Task:
+    """Return a task of classes as a regression if its label is continuous.
+
+    By "auto" it is one if the column has a number with a fraction: a stiffness of 10.25 is no
+    class. Whole numbers may be names of classes (object 17), so they are a regression by "yes"
+    alone. Raises UserError for "yes" on text.
+    """
+    fixed = task.kind == "regression" or task.above is not None or bool(task.classes)
+    if fixed or task.label not in table.table.column_names or regression == "no":
+        return task
+    kind = table.column(task.label).type
+    is_number = pa.types.is_floating(kind) or pa.types.is_integer(kind)
+    if regression == "yes":
+        if not is_number:
+            raise UserError(
+                f"Column {task.label!r} contains text. A regression needs numbers. Leave out "
+                "--regression yes."
+            )
+        return replace(task, kind="regression")
+    if not pa.types.is_floating(kind):
+        return task
+    values = table.number_column(task.label)
+    values = values[np.isfinite(values)]
+    if (values != np.round(values)).any():
+        return replace(task, kind="regression")
+    return task
 
 
 def find_column(table: Manifest, name: str) -> str:
@@ -254,8 +294,9 @@ def find_column(table: Manifest, name: str) -> str:
 
 
 def described_subsets(table: Manifest, column: str, rows: Array, name: str) -> dict[str, Array]:
-    """Return masks over `rows` (n,): values of `column` with a photograph or caption in train, and
-    others, or {}.
+    """Return masks over `rows` (n,): values of `column` that alignment may have named, and others.
+
+    Those are values with a photograph or caption in train. {} if all values are of one kind.
     """
     values = table.text_column(column)
     described = (table.present("image_path") | table.present("text")) & (
@@ -268,70 +309,89 @@ def described_subsets(table: Manifest, column: str, rows: Array, name: str) -> d
 
 
 def select(table: Manifest, task: Task, frames: int | None = None) -> TaskRows:
-    """Return the rows of a task in the manifest's order; `frames` above the task's selects rows
-    that end such a clip.
+    """Return the rows of a task in the manifest's order.
 
-    A still (`frames` 1) of a task on clips takes the same rows as the clips do. Raises UserError
+    `frames` above the task's selects rows that end such a clip. A still (`frames` 1) of a task on
+    clips takes the same rows as the clips do, so that both can be compared. Raises UserError
     without the label.
     """
     task = replace(task, label=_label_column(table, task))
     if not _has_values(table, task.label):
-        known = (
-            ", ".join(name for name in table.table.column_names if name.startswith("label."))
-            or "none"
-        )
+        columns = [name for name in table.table.column_names if name.startswith("label.")]
         raise UserError(
             f"Task {task.name}: no row has a value in column {task.label!r}. The labels are "
-            f"{known}."
+            f"{', '.join(columns) or 'none'}."
         )
     labels = _labels(table, task)
-    split = table.text_column("split")
-    if task.test_list is not None:  # whichever list decided the split of this manifest
-        if "downstream_test" not in table.table.column_names:
-            raise UserError(
-                f"Task {task.name} needs the column downstream_test. Index the data set again."
-            )
-        listed = [
-            task.test_list in name.split("+") for name in table.text_column("downstream_test")
-        ]
-        split = np.where(listed, "test", "train")
-    used = labels != "" if labels.dtype.kind == "U" else np.isfinite(labels)
-    used &= np.isin(split, ("train", "val", "test")) & ~np.isin(
-        table.text_column("sensor"), FIELD_SENSORS
-    )
-    for column, value in task.where:
-        used &= (
-            table.text_column(column) == value
-            if isinstance(value, str)
-            else table.number_column(column) > value
-        )
-    length = max(task.frames, frames or 1)
-    if length > 1:
-        used &= np.isin(np.arange(len(table)), table.clips(length)[:, -1])
+    split = _split(table, task)
+    used = _takes_part(table, task, labels, split, frames or 1)
     first = _choose_frames(table, task.which, np.flatnonzero(used))
-    rows, first, notes = (
-        _pair_fingers(table, task, first) if task.fingers else (first[:, None], first, ())
-    )
+    rows = first[:, None]
+    notes: tuple[str, ...] = ()
+    if task.fingers:
+        rows, first, notes = _pair_fingers(table, task, first)
     if not len(rows):
-        lacking = (
-            " and two fingers" if task.fingers else "" if task.which == "all" else " and contact"
-        )
         raise UserError(
             f"Task {task.name}: no row of split train, val or test has a label in "
-            f"{task.label!r}{lacking}. "
-            "Check the filters and the splits."
+            f"{task.label!r}{_also_needed(task)}. Check the filters and the splits."
         )
     if labels.dtype.kind == "U":
-        notes += tuple(
-            f"Classes {' and '.join(map(repr, alike))} differ only by spaces, letter case or "
-            "Unicode form. They are "
-            "probed as different classes."
-            for alike in spellings(labels[first].tolist())
-        )
-    sensors, units = (table.text_column(name)[first] for name in ("sensor", "unit"))
+        for alike in spellings(labels[first].tolist()):
+            notes += (
+                f"Classes {' and '.join(map(repr, alike))} differ only by spaces, letter case or "
+                "Unicode form. They are probed as different classes.",
+            )
     return TaskRows(
-        rows, labels[first], _groups(table, task.groups)[first], split[first], sensors, units, notes
+        rows,
+        labels[first],
+        _groups(table, task.groups)[first],
+        split[first],
+        table.text_column("sensor")[first],
+        table.text_column("unit")[first],
+        notes,
     )
+
+
+def _also_needed(task: Task) -> str:
+    """Return what a row needs beside a label, to end a sentence."""
+    if task.fingers:
+        return " and two fingers"
+    if task.which == "all":
+        return ""
+    return " and contact"
+
+
+def _split(table: Manifest, task: Task) -> Array:
+    """Return the split of each row, by the list that a benchmark tests on if it names one."""
+    if task.test_list is None:
+        return table.text_column("split")
+    # Data sets with several lists have one column `split`, by whichever list it was indexed.
+    if "downstream_test" not in table.table.column_names:
+        raise UserError(
+            f"Task {task.name} needs the column downstream_test. Index the data set again."
+        )
+    lists = table.text_column("downstream_test")
+    listed = [task.test_list in names.split("+") for names in lists]
+    return np.where(listed, "test", "train")
+
+
+def _takes_part(table: Manifest, task: Task, labels: Array, split: Array, frames: int) -> Array:
+    """Return which rows have a label and picture, a split that counts, and pass the filters."""
+    if labels.dtype.kind == "U":
+        used = labels != ""
+    else:
+        used = np.isfinite(labels)
+    used &= np.isin(split, ("train", "val", "test"))
+    used &= ~np.isin(table.text_column("sensor"), FIELD_SENSORS)
+    for column, value in task.where:
+        if isinstance(value, str):
+            used &= table.text_column(column) == value
+        else:
+            used &= table.number_column(column) > value
+    length = max(task.frames, frames)
+    if length > 1:
+        used &= np.isin(np.arange(len(table)), table.clips(length)[:, -1])
+    return used
 
 
 def label_text(value: Any, source: str = "The label") -> str:
@@ -350,7 +410,8 @@ def label_text(value: Any, source: str = "The label") -> str:
         return str(value)
     if not np.isfinite(value) or value != int(value):
         raise UserError(
-            f"{source} contains {value:g}, a measured quantity, not a class. Probe it as a number."
+            f"{source} contains {value:g}, a measured quantity, not a class. Probe it with "
+            "--regression yes, or in Python with measured=True."
         )
     return str(int(value))
 
@@ -361,8 +422,7 @@ def _has_values(table: Manifest, column: str) -> bool:
 
 def _label_column(table: Manifest, task: Task) -> str:
     """Return the label column of a task; `object` falls back to the manifest's object column."""
-    fallback = task.label == "label.object" and task.label not in table.table.column_names
-    if fallback:
+    if task.label == "label.object" and task.label not in table.table.column_names:
         return "object"
     return task.label
 
@@ -372,7 +432,8 @@ def _labels(table: Manifest, task: Task) -> Array:
         number = table.number_column(task.label)
         if task.above is None:
             return number
-        return np.where(np.isfinite(number), np.where(number > task.above, "yes", "no"), "")
+        answer = np.where(number > task.above, "yes", "no")
+        return np.where(np.isfinite(number), answer, "")
     values = table.column(task.label).to_pylist()
     texts = np.array([label_text(value, f"Column {task.label!r}") for value in values], dtype=str)
     if task.classes:
@@ -381,6 +442,7 @@ def _labels(table: Manifest, task: Task) -> Array:
 
 
 def _choose_frames(table: Manifest, which: Which, rows: Array) -> Array:
+    """Return those of `rows` that a task asks about; see `Task.which`."""
     if which == "all":
         return rows
     rows = rows[_touching(table)[rows]]
@@ -397,32 +459,38 @@ def _choose_frames(table: Manifest, which: Which, rows: Array) -> Array:
     np.maximum.at(last, sequence, frame)
     # motion lasts from a third to five sixths of a recording
     late = -np.abs(frame - 2 / 3 * last[sequence])[rows]
+    # rounded, so that the noise of the last digits does not outvote the moment
     slip = np.nan_to_num(table.number_column("label.slip")[rows], nan=0.0).round(2)
     return np.sort(best_rows(rows, sequence[rows], slip, late))
 
 
 def best_rows(rows: Array, groups: Array, *keys: Array) -> Array:
-    """Return the row of each group (n,) with the largest first key (n,), then the next key, then
-    the earliest.
+    """Return the row of each group (n,) with the largest first key (n,).
+
+    Of equals it is that with the largest next key, then the earliest.
     """
-    order = np.lexsort((rows, *(-key for key in reversed(keys)), groups))
-    return rows[order[np.unique(groups[order], return_index=True)[1]]]
+    descending = [-key for key in reversed(keys)]
+    order = np.lexsort((rows, *descending, groups))
+    first = np.unique(groups[order], return_index=True)[1]
+    return rows[order[first]]
 
 
 def _touching(table: Manifest) -> Array:
-    """Return whether each frame is contact, bool (rows,), by force, flag or score; all are in a
-    file without these.
+    """Return whether each frame is contact, bool (rows,), by force, flag or score.
+
+    In a file without these all frames are.
     """
     # Force comes first: a flag or a score depends on the picture, and would leave out soft objects
     # for some sensors.
-    force, contact_score = (
-        table.number_column(f"label.{name}") for name in ("force", "contact_score")
+    measures = (
+        (table.number_column("label.force"), FORCE),
+        (known_contact(table), 0.5),
+        (table.number_column("label.contact_score"), SCORE),
     )
-    flag = known_contact(table)
     touches = np.ones(len(table), bool)
     for source in range(len(table.files)):
         here = table.source == source
-        for values, least in ((force, FORCE), (flag, 0.5), (contact_score, SCORE)):
+        for values, least in measures:
             if np.isfinite(values[here]).any():
                 touches[here] = np.nan_to_num(values[here], nan=-1.0) > least
                 break
@@ -430,23 +498,27 @@ def _touching(table: Manifest) -> Array:
 
 
 def _groups(table: Manifest, columns: Sequence[str]) -> Array:
-    """Return the group of each row: the first column with a value, else the sequence; keys differ
-    between manifests.
+    """Return the group of each row: the first column with a value, else the sequence.
+
+    Touches and recordings are numbered in each manifest anew, so keys of several manifests differ.
     """
     sequence = table.text_column("sequence")
-    file = np.array(
-        [f" of file {number}" if len(table.files) > 1 else "" for number in table.source], dtype=str
-    )
+    file = np.full(len(table), "")
+    if len(table.files) > 1:
+        file = np.array([f" of file {number}" for number in table.source])
     groups = np.char.add(np.char.add("sequence ", sequence), file)
     for name in reversed(columns):
         if name == "recording":
-            recordings = np.array(
-                [f"recording {key.rpartition('/')[0] or key}" for key in sequence]
-            )
-            groups = np.char.add(recordings, file) if len(set(recordings)) > 1 else groups
+            names = [key.rpartition("/")[0] or key for key in sequence]
+            recordings = np.array([f"recording {one}" for one in names])
+            # One name for all says nothing: it is a folder that holds the recordings.
+            if len(set(recordings)) > 1:
+                groups = np.char.add(recordings, file)
         elif name in table.table.column_names:
             values = table.text_column(name)
-            keys = np.char.add(values, file) if name in KEYS else values
+            keys = values
+            if name in KEYS:
+                keys = np.char.add(values, file)
             groups = np.where(values != "", np.char.add(f"{name} ", keys), groups)
     return groups
 
@@ -459,8 +531,9 @@ def _grasp_column(table: Manifest) -> str:
 
 
 def _pair_fingers(table: Manifest, task: Task, rows: Array) -> tuple[Array, Array, tuple[str, ...]]:
-    """Return rows (n, 2) of the two units of each grasp, by the units' names; the labelled row of
-    each; and notes.
+    """Return rows (n, 2) of the two sensor instances of each grasp, in the order of their names.
+
+    Then come the labelled row of each grasp, and notes.
     """
     name = _grasp_column(table)
     rows = rows[table.present(name)[rows] & table.present("unit")[rows]]
@@ -474,25 +547,12 @@ def _pair_fingers(table: Manifest, task: Task, rows: Array) -> tuple[Array, Arra
     whole = starts[counts == 2]
     whole = whole[unit[whole] != unit[whole + 1]]
     pairs = rows[whole[:, None] + np.arange(2)]
-    notes = (
-        [f"{len(starts) - len(whole)} grasps without two fingers left out"]
-        if len(starts) > len(whole)
-        else []
-    )
+    notes = []
+    if len(starts) > len(whole):
+        notes.append(f"{len(starts) - len(whole)} grasps without two fingers left out")
     labelled = pairs[:, 0]
     if task.phase == "after":
-        # of the form <grasp>/after/<finger>
-        sequence = table.text_column("sequence")
-        source = table.source
-        after = {
-            (source[row], sequence[row]): row
-            for row in range(len(table))
-            if "/after/" in sequence[row]
-        }
-        keys = [
-            (source[row], sequence[row].replace("/during/", "/after/")) for row in pairs.ravel()
-        ]
-        pairs = np.array([after.get(key, -1) for key in keys], np.int64).reshape(pairs.shape)
+        pairs = _frames_after(table, pairs)
         complete = (pairs >= 0).all(1)
         pairs = pairs[complete]
         labelled = labelled[complete]
@@ -500,3 +560,21 @@ def _pair_fingers(table: Manifest, task: Task, rows: Array) -> tuple[Array, Arra
             notes.append(f"{np.sum(~complete)} grasps without both frames after left out")
     order = np.argsort(labelled)
     return pairs[order], labelled[order], tuple(notes)
+
+
+def _frames_after(table: Manifest, pairs: Array) -> Array:
+    """Return the rows (n, 2) after the grasp of rows during it, -1 where there is none.
+
+    Recordings of Feel are called <grasp>/during/<finger> and <grasp>/after/<finger>.
+    """
+    sequence = table.text_column("sequence")
+    source = table.source
+    after = {}
+    for row in range(len(table)):
+        if "/after/" in sequence[row]:
+            after[source[row], sequence[row]] = row
+    found = []
+    for row in pairs.ravel():
+        later = sequence[row].replace("/during/", "/after/")
+        found.append(after.get((source[row], later), -1))
+    return np.array(found, np.int64).reshape(pairs.shape)

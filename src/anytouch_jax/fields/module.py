@@ -1,8 +1,7 @@
-"""Decoder of fields: depth, shear, contact and force from the states of the touch encoder and from
-its pixels.
+"""Decoder of fields: depth, shear, contact and force from encoder states and pixels.
 
-Every output is free of scale: lengths are shares of the picture's width, stresses shares of the
-gel's modulus. So a network that was trained on units of any zoom reads a sensor of any size.
+Every output is free of scale: lengths are over the image's width, stresses over the gel's modulus.
+So a network that was trained on sensors of any zoom reads one of any size.
 """
 
 from __future__ import annotations
@@ -19,8 +18,10 @@ from anytouch_jax.nn.layers import Dense, LayerNorm, Mlp, gelu, product, stored,
 
 
 def windows(x: Array, side: int, stride: int = 2) -> Array:
-    """Every `stride`th window of `side` x `side` pixels (odd) of x (B, H, W, C), zeros around it:
-    (B, ceil(H / stride), ceil(W / stride), side * side * C), in the order (row, col, channel).
+    """Return every `stride`th window of `side` x `side` pixels (odd) of x (B, H, W, C).
+
+    There are zeros around the image. The result is (B, ceil(H / stride), ceil(W / stride),
+    side * side * C), a window in the order (row, column, channel).
     """
     around = side // 2
     x = jnp.pad(x, ((0, 0), (around, around), (around, around), (0, 0)))
@@ -34,29 +35,34 @@ def windows(x: Array, side: int, stride: int = 2) -> Array:
 
 
 def convolved(x: Array, kernel: Array, side: int, stride: int, dtype: DTypeLike) -> Array:
-    """Convolve x (B, H, W, C) with a square kernel (side * side * C, outputs), rows in the order of
-    `windows`.
+    """Convolve x (B, H, W, C) with a square kernel, zeros around x.
+
+    Args:
+        x: Maps (B, H, W, C).
+        kernel: (side * side * C, outputs), rows in the order of `windows`.
+        side: Pixels of the kernel, odd.
+        stride: Pixels from one output to the next.
+        dtype: Both operands are rounded to it.
     """
-    if (
-        jax.default_backend() != "cpu"
-    ):  # without tuning, cuDNN's gradient of so few channels takes a second
+    if jax.default_backend() != "cpu":
+        # As a product: without tuning, cuDNN's gradient of so few channels takes a second.
         x = windows(x, side, stride)
-        return product(x.reshape(-1, x.shape[-1]), kernel, dtype).reshape(
-            *x.shape[:-1], kernel.shape[-1]
-        )
-    a, b = (
-        value.astype(dtype).astype(x.dtype)
-        for value in (x, kernel.reshape(side, side, x.shape[-1], -1))
-    )
+        y = product(x.reshape(-1, x.shape[-1]), kernel, dtype)
+        return y.reshape(*x.shape[:-1], kernel.shape[-1])
+    # On a CPU the windows would be written to memory, side * side times the size of x. Values are
+    # rounded to `dtype`, and computed in the type of x as all but products is there (`stored`).
+    rounded = x.astype(dtype).astype(x.dtype)
+    square = kernel.reshape(side, side, x.shape[-1], -1).astype(dtype).astype(x.dtype)
     around = [(side // 2, side // 2)] * 2
     return lax.conv_general_dilated(
-        a, b, (stride, stride), around, dimension_numbers=("NHWC", "HWIO", "NHWC")
+        rounded, square, (stride, stride), around, dimension_numbers=("NHWC", "HWIO", "NHWC")
     )
 
 
 class Convolution(nnx.Module):
-    """A square convolution (B, H, W, C) with zeros around it, after a norm over the channels if
-    `norm`.
+    """A square convolution (B, H, W, C) with zeros around it, after a norm over the channels.
+
+    Without `norm` there is none.
     """
 
     def __init__(
@@ -77,10 +83,10 @@ class Convolution(nnx.Module):
         self.dtype = jnp.dtype(model.dtype)
 
     def __call__(self, x: Array) -> Array:
-        x = x if self.norm is None else gelu(self.norm(x))
-        x = convolved(
-            x.astype(stored(self.dtype)), self.kernel[...], self.side, self.stride, self.dtype
-        )
+        if self.norm is not None:
+            x = gelu(self.norm(x))
+        x = x.astype(stored(self.dtype))
+        x = convolved(x, self.kernel[...], self.side, self.stride, self.dtype)
         return x + self.bias[...].astype(x.dtype)[None, None, None]
 
 
@@ -103,9 +109,10 @@ class FieldDecoder(nnx.Module):
         self.middle1 = Convolution(many + few, many, 3, model)
         self.middle2 = Convolution(many, many, 3, model)
         self.deep = Convolution(many, most, 3, model, stride=2)
-        self.deep1, self.deep2, self.deep3, self.deep4 = (
-            Convolution(most, most, 3, model) for _ in range(4)
-        )
+        self.deep1 = Convolution(most, most, 3, model)
+        self.deep2 = Convolution(most, most, 3, model)
+        self.deep3 = Convolution(most, most, 3, model)
+        self.deep4 = Convolution(most, most, 3, model)
         self.light = Dense(most, most, model)
         self.up = Dense(most, many, model)
         self.fine1 = Convolution(many + few // 2, few, 3, model)
@@ -116,12 +123,13 @@ class FieldDecoder(nnx.Module):
         self.grid = model.image_size // model.patch
 
     def __call__(self, states: Array, clip: Array, aspect: Array) -> FieldOutput:
-        """Decode `states` (B, 1 + S + N, STATES * D) of normalised `clip` (B, T, H, W, 3), fields
-        of its last frame.
+        """Return the fields of the last frame of clips.
 
-        `aspect` (B,) is the logarithm of the height over the width that the picture shows.
+        `states` are (B, 1 + S + N, STATES * D), `clip` is normalised (B, T, H, W, 3), and `aspect`
+        (B,) the logarithm of the height over the width that the image shows.
         """
         tokens = self.read(states[:, self.special :]) + self.aspect(aspect[:, None])[:, None]
+        # The change since the first frame shows how dots moved.
         sharp = self.stem(jnp.concatenate([clip[:, -1], clip[:, -1] - clip[:, 0]], -1))
         x = self.down(sharp)
         coarse = _resized(tokens.reshape(len(clip), self.grid, self.grid, tokens.shape[-1]), x)
@@ -130,7 +138,7 @@ class FieldDecoder(nnx.Module):
         deep = self.deep(x)
         deep = deep + self.deep1(deep)
         deep = deep + self.deep2(deep)
-        # The whole picture shows the lights of the unit.
+        # The whole image shows the lights of the device.
         deep = deep + self.light(gelu(jnp.mean(deep, (1, 2))))[:, None, None]
         deep = deep + self.deep3(deep)
         deep = deep + self.deep4(deep)
@@ -139,27 +147,26 @@ class FieldDecoder(nnx.Module):
         x = self.fine1(jnp.concatenate([_resized(x, sharp), sharp], -1))
         x = x + self.fine2(x)
         maps = self.maps(gelu(x)).astype(jnp.float32)
-        whole = self.whole(jnp.concatenate([states[:, 0], pooled.astype(states.dtype)], -1)).astype(
-            jnp.float32
-        )
+        both = jnp.concatenate([states[:, 0], pooled.astype(states.dtype)], -1)
+        whole = self.whole(both).astype(jnp.float32)
         contact = maps[..., 3]
         pressure = STRESS * jax.nn.softplus(maps[..., 4]) * jax.nn.sigmoid(contact)
         # The normal force is the integral of the pressure: there is none without contact.
         normal = jnp.mean(pressure, (1, 2)) * jnp.exp(aspect)
         force = jnp.concatenate([FORCE * whole[:, :2], normal[:, None]], -1)
         return FieldOutput(
-            LENGTH * maps[..., 0],
-            LENGTH * maps[..., 1:3],
-            contact,
-            pressure,
-            maps[..., 5],
-            maps[..., 6],
-            force,
-            TORQUE * whole[:, 2],
-            whole[:, 3],
-            whole[:, 4:6],
-            whole[:, 6],
-            whole[:, 7],
+            depth=LENGTH * maps[..., 0],
+            shear=LENGTH * maps[..., 1:3],
+            contact=contact,
+            pressure=pressure,
+            depth_log=maps[..., 5],
+            shear_log=maps[..., 6],
+            force=force,
+            torque=TORQUE * whole[:, 2],
+            slip=whole[:, 3],
+            force_log=whole[:, 4:6],
+            torque_log=whole[:, 6],
+            slip_log=whole[:, 7],
         )
 
 

@@ -1,5 +1,4 @@
-"""Health of sensor units: orientation, colour order, exposure, focus, frozen frames, drift, wear,
-background, contact.
+"""Health of sensors: layout, exposure, focus, frozen frames, drift, wear, background, contact.
 
 A check reads some recordings of a unit and gives a value, a limit and what to do. The limits were
 set on real units in good order (`experiments/real/trust.py`). Pictures are compared at 160 pixels
@@ -8,9 +7,9 @@ on the long side.
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
-from itertools import pairwise, product
+from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -20,24 +19,30 @@ from anytouch_jax.data.background.contact import DEFAULT_THRESHOLD, THRESHOLDS, 
 from anytouch_jax.data.background.estimate import (
     DOT_DEPTH,
     UntouchedGel,
-    close_dots,
     has_dots,
     scale_picture,
+)
+
+# Some of these names were defined here, and are asked for here.
+from anytouch_jax.data.background.layout import (  # noqa: F401
+    ORIENTATION,
+    Check,
+    UnitFrames,
+    check_layout,
+    known_gels,
+    small_look,
 )
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.manifest.manifest import Manifest, group_rows
 from anytouch_jax.encoder.arrays import Array
 from anytouch_jax.errors import UserError
-from anytouch_jax.files import read_arrays
 
-# real untouched gels, in the package
-_LOOKS = Path(__file__).parents[1] / "sim" / "sensing" / "photometry.npz"
-# that are read of a unit, and of a recording
-RECORDINGS = 24
-FRAMES = 6
-SIDE = 16  # of the layout of a picture
+RECORDINGS = 24  # that are read of a unit
+FRAMES = 6  # that are read of a recording
+# What sensors in good order stay within. Units are those of the checks' values: fractions, grey
+# levels, or pixels of a picture of 160.
 LIMITS = {
-    "orientation": 0.10,
+    "orientation": ORIENTATION,
     "exposure": 0.25,
     "focus": 0.5,
     "detail": 0.7,
@@ -53,92 +58,7 @@ LIMITS = {
 _SHARE = 0.25  # of recordings that look like another unit
 _ALIKE = 0.6  # distance within another unit, as a share of that between the two
 _DOTS = 21  # pixels of the widest marker dots, at 160 pixels
-# correlation of a unit with its family, and recordings from which a fixed pattern is judged
-_LIKE = 0.6
-_FEWEST = 4
-_TURNS = (
-    (0, False),
-    (1, False),
-    (2, False),
-    (3, False),
-    (0, True),
-    (1, True),
-    (2, True),
-    (3, True),
-)
-_NAMES = {
-    (1, False): "turned by 90 degrees",
-    (2, False): "upside down",
-    (3, False): "turned by 270 degrees",
-    (0, True): "mirrored left to right",
-    (2, True): "mirrored top to bottom",
-    (1, True): "mirrored and turned",
-    (3, True): "mirrored and turned",
-}
-_OPTIONS = {
-    (1, False): "--rotate 90",
-    (2, False): "--rotate 180",
-    (3, False): "--rotate 270",
-    (0, True): "--flip across",
-    (2, True): "--flip down",
-}
-
-
-@dataclass(frozen=True)
-class Check:
-    """The result of a check: `ok` is None if it cannot be decided; `advice` is what to do if it
-    failed.
-    """
-
-    name: str
-    ok: bool | None
-    value: str
-    advice: str = ""
-
-
-@dataclass(frozen=True, eq=False)
-class UnitFrames:
-    """Frames of one sensor unit: `recordings` are lists of pictures RGB u8 (h, w, 3), in order, all
-    of one size.
-
-    `background` is its untouched gel. `steps` (n,): distances of neighbouring frame numbers. `rows`
-    counts all.
-    """
-
-    sensor: str
-    unit: str
-    recordings: Sequence[Sequence[Array]]
-    background: Array | None = None
-    steps: Array = field(default_factory=lambda: np.ones(0))
-    rows: int = 0
-
-    @property
-    def frames(self) -> list[Array]:
-        """All pictures that were read."""
-        return [frame for recording in self.recordings for frame in recording]
-
-    @cached_property
-    def small(self) -> list[Array]:
-        """The pictures of each recording at 160 pixels, u8 (n, h, w, 3)."""
-        return [
-            np.stack([scale_picture(frame) for frame in recording]) for recording in self.recordings
-        ]
-
-    @cached_property
-    def middles(self) -> list[Array]:
-        """The median picture of each recording at 160 pixels."""
-        return [np.median(small, axis=0).astype(np.uint8) for small in self.small]
-
-    @cached_property
-    def usual(self) -> Array:
-        """The median of all recordings at 160 pixels: what never moves."""
-        return np.median(np.stack(self.middles), axis=0).astype(np.uint8)
-
-    def untouched(self) -> Array:
-        """Return the background, or the usual picture without one."""
-        if self.background is None:
-            return self.usual
-        return self.background
+_FEWEST = 4  # recordings from which a fixed pattern is judged
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,16 +97,22 @@ def read_units(manifest: Manifest) -> Iterator[UnitFrames]:
         ordered = rows[np.lexsort((number[rows], sequence[rows]))]
         same = np.diff(sequence[ordered]) == 0
         steps = (np.diff(number[ordered]) / stride[ordered[1:]])[same]
-        starts = np.flatnonzero(np.r_[True, ~same]) if len(ordered) else np.zeros(0, int)
-        parts = np.split(ordered, starts[1:]) if len(ordered) else []
-        chosen = [parts[i] for i in spread(np.arange(len(parts)), RECORDINGS)]
-        recordings = [read for part in chosen if (read := _pictures(manifest, part[:FRAMES]))]
+        parts = []
+        if len(ordered):
+            parts = np.split(ordered, np.flatnonzero(~same) + 1)
+        recordings = []
+        for place in spread(np.arange(len(parts)), RECORDINGS):
+            pictures = _pictures(manifest, parts[place][:FRAMES])
+            if pictures:
+                recordings.append(pictures)
         free = _background(manifest, rows, group[split[group] == "background"])
         if not recordings and free is not None:
             recordings = [[free]]
-        shapes = [recording[0].shape for recording in recordings]
-        recordings = [r for r in recordings if r[0].shape == max(set(shapes), key=shapes.count)]
         if recordings:
+            # Checks compare pixels, so recordings of another size are left out.
+            shapes = [recording[0].shape for recording in recordings]
+            usual = max(set(shapes), key=shapes.count)
+            recordings = [recording for recording in recordings if recording[0].shape == usual]
             sensor, unit = (
                 str(manifest.column(name)[int(group[0])].as_py() or "") for name in names[1:]
             )
@@ -202,16 +128,13 @@ def _pictures(manifest: Manifest, rows: Array) -> list[Array]:
 
 
 def _background(manifest: Manifest, rows: Array, free: Array) -> Array | None:
-    """Return the commonest background picture of `rows`, or the first picture of the `free`
-    rows.
-    """
-    paths = [
-        manifest.file(int(row), "background_path")
-        for row in rows[manifest.present("background_path")[rows]]
-    ]
-    paths = (
-        [max(set(paths), key=paths.count)] if paths else [manifest.file(int(row)) for row in free]
-    )
+    """Return the commonest background picture of `rows`, or the first of the `free` rows."""
+    named = rows[manifest.present("background_path")[rows]]
+    paths = [manifest.file(int(row), "background_path") for row in named]
+    if paths:
+        paths = [max(set(paths), key=paths.count)]
+    else:
+        paths = [manifest.file(int(row)) for row in free]
     for path in paths:
         with suppress(UserError):
             return decode(path)
@@ -226,113 +149,53 @@ def examine(
 ) -> UnitHealth:
     """Return the checks of a unit, or the one called `only`.
 
-    `references` are untouched gels of the same family. Recordings are compared with the `others` of
-    the data.
+    Args:
+        unit: its frames.
+        references: backgrounds RGB u8 of the same family of sensors.
+        others: units of the same data, with which its recordings are compared.
+        only: the name of a check.
+
+    Raises:
+        KeyError: no check has the name.
     """
     checks: dict[str, Callable[[], Check]] = {
-        "orientation and colours": lambda: check_layout(unit, references),
-        "one unit": lambda: _one_unit(unit, others),
-        "exposure": lambda: _exposure(unit),
-        "focus": lambda: _focus(unit),
-        "frozen frames": lambda: _frozen(unit),
-        "dropped frames": lambda: _dropped(unit),
-        "tint drift": lambda: _tint(unit),
-        "worn gel": lambda: _scratch(unit),
-        "dead pixels": lambda: _dead(unit),
-        "background": lambda: _background_fits(unit),
-        "contact": lambda: _contact(unit),
+        "orientation and colours": partial(check_layout, unit, references),
+        "one unit": partial(_one_unit, unit, others),
+        "exposure": partial(_exposure, unit),
+        "focus": partial(_focus, unit),
+        "frozen frames": partial(_frozen, unit),
+        "dropped frames": partial(_dropped, unit),
+        "tint drift": partial(_tint, unit),
+        "worn gel": partial(_scratch, unit),
+        "dead pixels": partial(_dead, unit),
+        "background": partial(_background_fits, unit),
+        "contact": partial(_contact, unit),
     }
     chosen = checks.values() if only is None else (checks[only],)
-    return UnitHealth(
-        unit.sensor, unit.unit, unit.rows, tuple(check() for check in chosen), unit.usual
-    )
+    found = tuple(check() for check in chosen)
+    return UnitHealth(unit.sensor, unit.unit, unit.rows, found, unit.usual)
 
 
 def check_units(
     units: Sequence[UnitFrames], references: Mapping[str, Sequence[Array]]
 ) -> list[UnitHealth]:
-    """Return the health of all units; `references` by sensor are joined by the other units of the
-    same sensor.
+    """Return the health of all units.
+
+    Backgrounds of the other units of a sensor join its `references`, which are by sensor.
     """
     results = []
     for unit in units:
         others = [other for other in units if other.sensor == unit.sensor and other is not unit]
-        # each costs time
+        # Each costs time.
         others = [others[i] for i in spread(np.arange(len(others)), RECORDINGS)]
         known = [*references.get(unit.sensor, ()), *(other.untouched() for other in others)]
         results.append(examine(unit, known, others))
     return results
 
 
-@lru_cache
-def known_gels(sensor: str) -> list[Array]:
-    """Return small untouched gels RGB u8 (30, 40, 3) of real units of a sensor family, none of an
-    unknown one.
-    """
-    name = f"{sensor}.bases"
-    gels = read_arrays(_LOOKS, only=name.__eq__).get(name, np.zeros(0))
-    # the simulator invents the look of the others
-    if gels.dtype == np.uint8:
-        return list(gels)
-    return []
-
-
-def check_layout(unit: UnitFrames, references: Sequence[Array]) -> Check:
-    """Compare with the references: which turn and order of colours fits them best? A near symmetry
-    is no fault.
-    """
-    name = "orientation and colours"
-    if not references:
-        return Check(name, None, "no reference of this sensor")
-    picture = unit.untouched()
-    known = np.stack([_layout(reference) for reference in references])
-    own = _layout(picture)
-    scores = dict[tuple[tuple[int, bool], bool], float]()
-    shapes = np.log([reference.shape[1] / reference.shape[0] for reference in references])
-    shape = np.log(picture.shape[1] / picture.shape[0])
-    for turn, swap in product(_TURNS, (False, True)):
-        if abs((-shape if turn[0] % 2 else shape) - np.median(shapes)) > 0.2:
-            continue
-        scores[turn, swap] = float(
-            np.median(np.sort((known * _turned(own, turn, swap)).sum((1, 2, 3)))[-3:])
-        )
-    if not scores or max(scores.values()) < _LIKE:
-        return Check(name, None, f"unlike its family ({max(scores.values(), default=0):.2f})")
-    upright = scores.pop((_TURNS[0], False), -1.0)
-    best = max(scores, key=lambda key: scores[key])
-    margin = scores[best] - upright
-    if margin <= LIMITS["orientation"]:
-        return Check(name, True, f"fits ({upright:.2f})")
-    # The picture was turned by the inverse of what makes it fit.
-    (turns, mirrored), swap = best
-    done = (turns, True) if mirrored else (-turns % 4, False)
-    what = " and ".join(
-        filter(None, (_NAMES.get(done, ""), "red and blue exchanged" if swap else ""))
-    )
-    cure = _OPTIONS.get(done, "a turn and a mirror") if done != _TURNS[0] else ""
-    advice = " and ".join(filter(None, (cure, "red and blue exchanged" if swap else "")))
-    return Check(name, False, f"{what} ({margin:+.2f})", f"Read it with {advice}.")
-
-
-def _layout(picture: Array) -> Array:
-    """Return where a picture has which colour, f32 (SIDE, SIDE, 3) of norm 1, without brightness
-    and contrast.
-    """
-    small = _look(np.ascontiguousarray(picture)).reshape(SIDE, SIDE, 3)
-    small = small - small.mean()
-    return np.asarray(small / max(float(np.linalg.norm(small)), 1e-6))
-
-
-def _turned(layout: Array, turn: tuple[int, bool], swap: bool) -> Array:
-    layout = np.rot90(layout[:, ::-1] if turn[1] else layout, turn[0])
-    if swap:
-        return layout[..., ::-1]
-    return layout
-
-
 def _exposure(unit: UnitFrames) -> Check:
     frames = np.concatenate(unit.small)[:, ::2, ::2]
-    # without the black rim of a round gel
+    # The black rim of a round gel says nothing about its light.
     lit = frames[frames.max(axis=3) > 8].reshape(-1, 3)
     burnt = float((lit >= 252).any(1).mean()) if len(lit) else 0.0
     mean = float(lit.mean()) if len(lit) else 0.0
@@ -344,13 +207,15 @@ def _exposure(unit: UnitFrames) -> Check:
 
 def _focus(unit: UnitFrames) -> Check:
     """Compare details of one pixel with those of two: blur removes the first."""
-    if max(unit.frames[0].shape) < 240:  # made larger, it would look blurred
+    if max(unit.frames[0].shape) < 240:
+        # It would be made larger, and then look blurred.
         return Check("focus", None, "too small a picture")
     shares = []
     details = []
     for frame in (recording[len(recording) // 2] for recording in unit.recordings):
         grey = scale_picture(frame, 320).mean(2).astype(np.float32)
-        one, two = (cv2.GaussianBlur(grey, (0, 0), sigma) for sigma in (1, 2))
+        one = cv2.GaussianBlur(grey, (0, 0), 1)
+        two = cv2.GaussianBlur(grey, (0, 0), 2)
         details.append(float(np.std(one - two)))
         shares.append(float(np.std(grey - one)) / (details[-1] + 1e-6))
     share = float(np.median(shares))
@@ -363,7 +228,11 @@ def _focus(unit: UnitFrames) -> Check:
 
 
 def _frozen(unit: UnitFrames) -> Check:
-    pairs = [np.array_equal(a, b) for r in unit.recordings for a, b in pairwise(r)]
+    pairs = [
+        np.array_equal(before, after)
+        for recording in unit.recordings
+        for before, after in pairwise(recording)
+    ]
     if not pairs:
         return Check("frozen frames", None, "stills")
     share = float(np.mean(pairs))
@@ -376,7 +245,7 @@ def _frozen(unit: UnitFrames) -> Check:
 
 
 def _dropped(unit: UnitFrames) -> Check:
-    # a longer gap separates clips
+    # A longer gap separates clips.
     near = unit.steps[(unit.steps > 0) & (unit.steps <= 4)]
     if not len(near):
         return Check("dropped frames", None, "stills")
@@ -390,11 +259,13 @@ def _dropped(unit: UnitFrames) -> Check:
 
 
 def _tint(unit: UnitFrames) -> Check:
-    """Measure the drift of colour from the first recordings to the last, in logarithms of red and
-    blue over green.
+    """Measure the drift of colour from the first recordings to the last.
+
+    It is that of the logarithms of red and blue over green, which brightness does not change.
     """
     if len(unit.recordings) < _FEWEST:
         return Check("tint drift", None, "too few recordings")
+    # 4 grey levels more keep the logarithms of a dark picture from being noise.
     colours = np.stack([np.median(middle, axis=(0, 1)) + 4 for middle in unit.middles])
     tint = np.log(colours[:, [0, 2]] / colours[:, 1:2])
     part = max(1, len(tint) // 4)
@@ -405,19 +276,24 @@ def _tint(unit: UnitFrames) -> Check:
 
 
 def _dead(unit: UnitFrames) -> Check:
-    frames = [frame for recording in unit.recordings for frame in recording[:1]]
-    away = None
-    for frame in frames:
-        peak = np.abs(frame.astype(np.int16) - cv2.medianBlur(frame, 3)).max(2)
-        away = peak if away is None else np.minimum(away, peak)
-    count = 0 if away is None or len(frames) < 3 else int((away > 40).sum())
-    ok = None if len(frames) < 3 else count <= LIMITS["dead pixels"]
+    """Count pixels that differ from their neighbours in every recording."""
+    peaks = []
+    for recording in unit.recordings:
+        frame = recording[0]
+        peaks.append(np.abs(frame.astype(np.int16) - cv2.medianBlur(frame, 3)).max(2))
+    if len(peaks) < 3:
+        # A single picture may show a speck of dust, or an edge.
+        return Check("dead pixels", None, "0", "Mask them, or exchange the camera.")
+    count = int((np.min(peaks, axis=0) > 40).sum())
+    ok = count <= LIMITS["dead pixels"]
     return Check("dead pixels", ok, str(count), "Mask them, or exchange the camera.")
 
 
 def _difference(unit: UnitFrames) -> tuple[Array, Array] | None:
-    """Return the usual picture minus the background f32 (h, w, 3) at 160 pixels without tint, and
-    where no dots are.
+    """Return what never moves and the background lacks, None if it cannot be told.
+
+    It is the usual picture minus the background f32 (h, w, 3) at 160 pixels, without tint, and a
+    mask f32 (h, w) of where no dots are: dots move, and are no wear.
     """
     if unit.background is None or unit.background.shape != unit.frames[0].shape:
         return None
@@ -436,19 +312,22 @@ def _difference(unit: UnitFrames) -> tuple[Array, Array] | None:
 
 def _blurred(change: Array, clear: Array, sigma: float) -> Array:
     """Return the blurred change of the clear pixels alone."""
+    # Of a pixel with few clear neighbours the mean would be noise, so the weight has a floor.
     weight = cv2.GaussianBlur(clear, (0, 0), sigma)
     return np.asarray(cv2.GaussianBlur(change, (0, 0), sigma) / np.maximum(weight, 0.1)[..., None])
 
 
 def _scratch(unit: UnitFrames) -> Check:
-    """Look for a long thin pattern that never moves and that the background lacks: a scratch, a
-    tear, a hair.
+    """Look for a scratch, a tear or a hair.
+
+    It is a long thin pattern that never moves and that the background lacks.
     """
     name = "worn gel"
     found = _difference(unit)
     if found is None or len(unit.recordings) < _FEWEST:
         return Check(name, None, "no background" if found is None else "too few recordings")
     change, clear = found
+    # Between the two blurs lie lines of some pixels. Noise is thinner, and touch is broader.
     thin = np.abs(_blurred(change, clear, 0.7) - _blurred(change, clear, 4)).max(2) * clear
     lines = cv2.dilate((thin[4:-4, 4:-4] > LIMITS["scratch"]).astype(np.uint8), np.ones((3, 3)))
     _, _, boxes, _ = cv2.connectedComponentsWithStats(lines)
@@ -460,8 +339,9 @@ def _scratch(unit: UnitFrames) -> Check:
 
 
 def _background_fits(unit: UnitFrames) -> Check:
-    """Compare the background with the usual picture: a press in one of them is a broad
-    difference.
+    """Compare the background with the usual picture.
+
+    A press in one of them is a broad difference.
     """
     name = "background"
     found = _difference(unit)
@@ -473,9 +353,9 @@ def _background_fits(unit: UnitFrames) -> Check:
 
 
 def _contact(unit: UnitFrames) -> Check:
-    """Report the share of frames in contact.
+    """Report the fraction of frames in contact.
 
-    All or none of many recordings is a fault of the data.
+    A touch that never ends, and does not move, is a fault of the data.
     """
     if unit.background is None or unit.background.shape != unit.frames[0].shape:
         return Check("contact", None, "no background")
@@ -486,44 +366,42 @@ def _contact(unit: UnitFrames) -> Check:
     frames = np.concatenate(unit.small)[::3]
     moves = UntouchedGel(unit.usual)
     touched = np.array([gel.score(frame) > limit for frame in frames])
-    still = np.mean([moves.score(frame) < limit / 2 for frame in frames]) if touched.all() else 0.0
-    constant = touched.all() and still > 0.9
+    constant = False
+    if touched.all():
+        still = np.mean([moves.score(frame) < limit / 2 for frame in frames])
+        constant = bool(still > 0.9)
     advice = "The touch never ends: check what rests on the gel, and the background."
     return Check("contact", not constant, f"{touched.mean():.0%} of frames", advice)
 
 
 def _one_unit(unit: UnitFrames, others: Sequence[UnitFrames]) -> Check:
-    """Look for recordings that look like another gel: two units in one folder, or left and right
-    exchanged.
-    """
+    """Look for recordings of another gel: two in one folder, or left and right exchanged."""
     name = "one unit"
     if len(unit.recordings) < _FEWEST:
         return Check(name, None, "too few recordings")
-    looks = np.stack([_look(middle) for middle in unit.middles])
-    middle = np.median(looks, axis=0)
-    own = np.sqrt(np.mean((looks - middle) ** 2, axis=1))
+    looks = np.stack([small_look(middle) for middle in unit.middles])
+    own = _distances(looks, np.median(looks, axis=0))
     for other in others:
-        if other.frames[0].shape == unit.frames[0].shape and len(other.recordings) >= _FEWEST:
-            away = np.sqrt(np.mean((looks - _look(other.usual)) ** 2, axis=1))
-            share = float(((own > LIMITS["two units"] / 2) & (away < 0.4 * own)).mean())
-            if share >= _SHARE:
-                advice = "Sort them by unit. Left and right may be exchanged."
-                return Check(
-                    name,
-                    False,
-                    f"{share:.0%} of recordings look like {other.unit or 'another'}",
-                    advice,
-                )
+        if other.frames[0].shape != unit.frames[0].shape or len(other.recordings) < _FEWEST:
+            continue
+        away = _distances(looks, small_look(other.usual))
+        # They are unlike this unit, and much more like the other.
+        exchanged = (own > LIMITS["two units"] / 2) & (away < 0.4 * own)
+        if exchanged.mean() >= _SHARE:
+            return Check(
+                name,
+                False,
+                f"{exchanged.mean():.0%} of recordings look like {other.unit or 'another'}",
+                "Sort them by unit. Left and right may be exchanged.",
+            )
     far = own > LIMITS["two units"]
+    is_one = far.mean() < _SHARE
+    if not is_one:
+        # Deep touches of a soft gel look unlike the others, and unlike each other. Those of another
+        # unit look alike.
+        apart = _distances(looks[far], np.median(looks[far], axis=0))
+        is_one = np.median(apart) > _ALIKE * np.median(own[far])
     value = float(np.percentile(own, 95))
-    # Deep touches of a soft gel look unlike the others, and unlike each other. Those of another
-    # unit look alike.
-    apart = (
-        np.sqrt(np.mean((looks[far] - np.median(looks[far], axis=0)) ** 2, axis=1))
-        if far.any()
-        else np.zeros(0)
-    )
-    is_one = far.mean() < _SHARE or np.median(apart) > _ALIKE * np.median(own[far])
     return Check(
         name,
         bool(is_one),
@@ -532,18 +410,21 @@ def _one_unit(unit: UnitFrames, others: Sequence[UnitFrames]) -> Check:
     )
 
 
-def _look(picture: Array) -> Array:
-    small = scale_picture(picture)
-    small = close_dots(small) if has_dots(small) else small
-    return cv2.resize(small, (SIDE, SIDE), interpolation=cv2.INTER_AREA).astype(np.float32).ravel()
+def _distances(looks: Array, other: Array) -> Array:
+    """Return the root mean square differences (n,) of looks (n, d) from another one (d,)."""
+    return np.asarray(np.sqrt(np.mean((looks - other) ** 2, axis=1)))
 
 
 def contact_visible(features: Array, contact: Array, draws: int = 200) -> Check:
-    """Return whether features (n, d) of frames in contact (n,) bool differ from the others more
-    than by chance.
+    """Return whether features of frames in contact differ from the others more than by chance.
 
-    The value is the distance of the means over the spread. The limit is that of 95 % of `draws`
-    random assignments.
+    The value is the distance of the means over the spread. Chance is what 95 % of random
+    assignments stay below.
+
+    Args:
+        features: (n, d).
+        contact: (n,) bool.
+        draws: how many assignments.
     """
     if min(contact.sum(), (~contact).sum()) < _FEWEST:
         return Check(
@@ -551,9 +432,8 @@ def contact_visible(features: Array, contact: Array, draws: int = 200) -> Check:
         )
 
     def apart(touched: Array) -> float:
-        within = np.concatenate(
-            [features[side] - features[side].mean(0) for side in (touched, ~touched)]
-        )
+        sides = [features[touched], features[~touched]]
+        within = np.concatenate([side - side.mean(0) for side in sides])
         gap = features[touched].mean(0) - features[~touched].mean(0)
         return float(np.linalg.norm(gap) / np.sqrt(np.square(within).sum(1).mean() + 1e-12))
 
@@ -573,27 +453,21 @@ def health_sheet(results: Sequence[UnitHealth], path: Path) -> None:
     """Write a PNG with the usual picture of each unit, its name and its verdict."""
     from anytouch_jax.files import atomic_write
 
-    bands = []
-    for unit in results:
-        band = np.full((132, 720, 3), 255, np.uint8)
-        tile = scale_picture(unit.picture, 124)[..., ::-1]
-        band[4 : 4 + tile.shape[0], 4 : 4 + tile.shape[1]] = tile
-        lines = [
-            f"{unit.sensor} {unit.unit}: {unit.verdict}",
-            *(f"{c.name}: {c.value}" for c in unit.faults),
-        ]
-        for place, line in enumerate(lines[:6]):
-            colour = (60, 60, 230) if unit.faults else (80, 150, 60)
-            text = line.encode("ascii", "replace").decode()[:80]
-            cv2.putText(
-                band,
-                text,
-                (140, 20 + 20 * place),
-                cv2.FONT_HERSHEY_SIMPLEX,
-                0.45,
-                colour,
-                1,
-                cv2.LINE_AA,
-            )
-        bands.append(band)
+    bands = [_band(unit) for unit in results]
     atomic_write(path, cv2.imencode(".png", np.vstack(bands))[1].tobytes())
+
+
+def _band(unit: UnitHealth) -> Array:
+    """Return the band of a unit on the sheet, BGR u8 (132, 720, 3)."""
+    band = np.full((132, 720, 3), 255, np.uint8)
+    tile = scale_picture(unit.picture, 124)[..., ::-1]
+    band[4 : 4 + tile.shape[0], 4 : 4 + tile.shape[1]] = tile
+    lines = [f"{unit.sensor} {unit.unit}: {unit.verdict}"]
+    lines += [f"{check.name}: {check.value}" for check in unit.faults]
+    colour = (60, 60, 230) if unit.faults else (80, 150, 60)
+    for place, line in enumerate(lines[:6]):
+        # OpenCV's letters are ASCII only.
+        text = line.encode("ascii", "replace").decode()[:80]
+        corner = (140, 20 + 20 * place)
+        cv2.putText(band, text, corner, cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, 1, cv2.LINE_AA)
+    return band

@@ -11,9 +11,11 @@ import jax.numpy as jnp
 from flax import nnx
 from jax import Array
 
+from anytouch_jax import doors
+from anytouch_jax.batch import FieldOutput
 from anytouch_jax.config import ModelConfig
-from anytouch_jax.fields.module import STATES, FieldDecoder, FieldOutput
 from anytouch_jax.nn.clip import ImageTower, Lora, TextEncoder
+from anytouch_jax.nn.heads import Head
 from anytouch_jax.nn.layers import Dense, Mlp, gelu, rows_of, table
 from anytouch_jax.nn.touch import TouchDecoder, TouchEncoder
 from anytouch_jax.ops import tokens
@@ -22,10 +24,10 @@ Features = TypeVar("Features")  # an array, or a tuple of arrays
 
 
 def _matcher(model: ModelConfig) -> Mlp | Dense | None:
-    """Return the head of Eq. 5, float32 at least: an MLP (paper), one linear layer (release), or
-    None (cosine).
-    """
-    model = replace(model, dtype="float32") if model.dtype == "bfloat16" else model
+    """Return the head of Eq. 5: an MLP (paper), one linear layer (release), or None (cosine)."""
+    # Logits of a product of unit vectors need more than 8 bits of mantissa.
+    if model.dtype == "bfloat16":
+        model = replace(model, dtype="float32")
     if model.match_head == "mlp":
         return Mlp(model.embed, model.embed, model, gelu, outputs=1)
     if model.match_head == "linear":
@@ -42,7 +44,9 @@ class AnyTouch(nnx.Module):
         self.frames = model.frames
         self.embed = model.embed
         if model.fields:
-            self.fields = FieldDecoder(model)
+            head: Head = doors.enter(doors.HEADS["fields"])
+            self.fields = head.build(model)
+            self.field_states = head.states
         if model.image is not None:
             self.image = ImageTower(model, model.image)
             if model.lora_rank:
@@ -65,37 +69,47 @@ class AnyTouch(nnx.Module):
     def encode_poolings(
         self, clip: Array, sensor: Array, join: str = "mean"
     ) -> tuple[Array, Array]:
-        """Return in one pass `encode_touch`, and the mean over projected patch tokens (the
-        release's "global").
+        """Return in one pass `encode_touch`, and the mean over projected patch tokens.
+
+        The release calls the mean "global".
         """
 
         def both(clip: Array, sensor: Array) -> tuple[Array, Array]:
-            hidden = self.touch.hidden(clip, sensor)
-            special = self.decoder.special
-            return self.touch.embedding(hidden[:, 0]), jnp.mean(
-                self.touch.projection(hidden[:, special:]), axis=1
-            )
+            return self._poolings(self.touch.hidden(clip, sensor))
 
         return self._over_segments(both, clip, sensor, join)
+
+    def _poolings(self, hidden: Array) -> tuple[Array, Array]:
+        """Return both poolings (B, E) of the last hidden states (B, 1 + S + N, D)."""
+        mean = jnp.mean(self.touch.projection(hidden[:, self.decoder.special :]), axis=1)
+        return self.touch.embedding(hidden[:, 0]), mean
 
     def _over_segments(
         self, features: Callable[[Array, Array], Features], clip: Array, sensor: Array, join: str
     ) -> Features:
+        """Return features of a clip of any length: those of its segments, joined."""
         if clip.shape[1] in (1, self.frames):
             return features(clip, sensor)
         parts = tokens.segments(clip, self.frames)
         b, s = parts.shape[:2]
-        joins = {
-            "mean": lambda z: z.mean(1),
-            "sum": lambda z: z.sum(1),
-            "concat": lambda z: z.reshape(b, s * z.shape[2]),
-        }
-        values = features(parts.reshape(b * s, *parts.shape[2:]), jnp.repeat(sensor, s))
-        return jax.tree.map(lambda z: joins[join](z.reshape(b, s, z.shape[-1])), values)
+
+        def joined(z: Array) -> Array:
+            z = z.reshape(b, s, z.shape[-1])
+            if join == "mean":
+                return z.mean(1)
+            if join == "sum":
+                return z.sum(1)
+            if join == "concat":
+                return z.reshape(b, s * z.shape[2])
+            raise ValueError(f"segments are joined by mean, sum or concat, not {join!r}")
+
+        flat = parts.reshape(b * s, *parts.shape[2:])
+        return jax.tree.map(joined, features(flat, jnp.repeat(sensor, s)))
 
     def encode_tokens(self, clip: Array, sensor: Array, keep_ids: Array | None = None) -> Array:
-        """Return the projected sequence (B, 1 + S + K, E) of [class, sensor tokens, patches]: the
-        decoder's input.
+        """Return the projected sequence (B, 1 + S + K, E), the decoder's input.
+
+        It is [class, sensor tokens, patches].
         """
         return self.touch.projection(self.touch.hidden(clip, sensor, keep_ids))
 
@@ -108,33 +122,31 @@ class AnyTouch(nnx.Module):
         frames: int,
         decoder_sensor: Array | None = None,
     ) -> Array:
-        """Return pixels (B, N, frames, P*P*3) of every position from the visible ones of `clip` (B,
-        T, H, W, 3).
-        """
+        """Return pixels (B, N, frames, P*P*3) of every position, see `Net.reconstruct`."""
         latent = self.encode_tokens(clip, sensor, keep_ids)
         own = None
-        if hasattr(self.decoder, "sensor_projection"):
-            own = rows_of(
-                self.touch.sensor_tokens[...], sensor if decoder_sensor is None else decoder_sensor
-            )
+        if self.decoder.takes_sensor_tokens:
+            rows = sensor if decoder_sensor is None else decoder_sensor
+            own = rows_of(self.touch.sensor_tokens[...], rows)
         return self.decoder(latent, restore_ids, frames, own)
 
     def measure(self, clip: Array, sensor: Array, aspect: Array) -> FieldOutput:
-        """Return the fields of the last frame of clips, see `FieldDecoder`."""
-        return self.fields(self.touch.states(clip, sensor, STATES), clip, aspect)
+        """Return the fields of the last frame of clips, see `fields.module.FieldDecoder`."""
+        return self.fields(self.touch.states(clip, sensor, self.field_states), clip, aspect)
 
     def encode_and_measure(
         self, clip: Array, sensor: Array, aspect: Array
     ) -> tuple[Array, Array, FieldOutput]:
         """Return in one pass `encode_poolings` and `measure` of clips of one segment."""
-        states = self.touch.states(clip, sensor, STATES)
-        hidden = states[..., -self.touch.width :]
-        mean = jnp.mean(self.touch.projection(hidden[:, self.decoder.special :]), axis=1)
-        return self.touch.embedding(hidden[:, 0]), mean, self.fields(states, clip, aspect)
+        states = self.touch.states(clip, sensor, self.field_states)
+        # The last of the concatenated states is the output of the last block.
+        embedding, mean = self._poolings(states[..., -self.touch.width :])
+        return embedding, mean, self.fields(states, clip, aspect)
 
     def match(self, z_first: Array, z_second: Array) -> Array:
-        """Return matching logits (B,) of two unit-norm touch embeddings (Eq. 5), from their
-        element-wise product.
+        """Return matching logits (B,) of two unit-norm touch embeddings (B, E) (Eq. 5).
+
+        They are computed from the element-wise product.
         """
         if self.matcher is None:
             raise ValueError("this network has no matching head (model.match_head is none)")

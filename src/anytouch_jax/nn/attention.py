@@ -1,6 +1,4 @@
-"""Multi-head attention in three equal forms: by XLA, by cuDNN, or mapped over cache-sized groups of
-heads.
-"""
+"""Multi-head attention in three equal forms: by XLA, by cuDNN, or mapped over groups of heads."""
 
 from __future__ import annotations
 
@@ -13,7 +11,7 @@ from jax import Array
 
 from anytouch_jax.config import ModelConfig
 
-# bytes of logits that fit in a core's cache: six heads of a still at 262 tokens
+# Bytes of logits that fit in a core's cache: six heads of a still at 262 tokens.
 CACHE = 1_700_000
 
 
@@ -26,44 +24,48 @@ def attention(
     causal: bool = False,
     mask: Array | None = None,
 ) -> Array:
-    """Return softmax(q k^T / sqrt(D)) v for q (B, Q, H, D), k, v (B, S, H, D); `mask` (B, S) bool
-    marks keys to read.
+    """Return softmax(q k^T / sqrt(D)) v, (B, Q, H, D).
 
-    `implementation` is "xla", "cudnn", "mapped" or "auto". "auto" is mapped on a single CPU device,
-    else XLA. A causal or masked call is never mapped (text is short), nor one with few queries.
-    cuDNN needs 16 bits, an even Q and no mask. XLA does the rest.
+    Args:
+        q: Queries (B, Q, H, D).
+        k: Keys (B, S, H, D).
+        v: Values (B, S, H, D).
+        implementation: "xla", "cudnn", "mapped" or "auto", which is mapped on a single CPU device,
+            else XLA. What a form cannot do, XLA does.
+        causal: Whether a query reads the keys up to its own place only.
+        mask: Keys to read, bool (B, S). None: all.
     """
     free = mask is None and not causal and q.shape == k.shape
     if implementation == "auto":
-        implementation = (
-            "mapped" if jax.default_backend() == "cpu" and jax.device_count() == 1 else "xla"
-        )
+        # Over several devices the map would run the groups of one device after those of another.
+        one_cpu = jax.default_backend() == "cpu" and jax.device_count() == 1
+        implementation = "mapped" if one_cpu else "xla"
+    # Text, which is causal and masked, is too short to gain, and so is a call with few queries.
     if implementation == "mapped" and free and q.size:
         return mapped(q, k, v)
     keys = None if mask is None else mask[:, None, None, :]
-    fit = mask is None and q.shape[1] % 2 == 0 and q.dtype in (jnp.bfloat16, jnp.float16)
-    known: Literal["cudnn", "xla"] = "cudnn" if implementation == "cudnn" and fit else "xla"
+    known: Literal["cudnn", "xla"] = "xla"
+    # cuDNN has no other precision, and refuses an odd number of queries.
+    is_narrow = q.dtype in (jnp.bfloat16, jnp.float16)
+    if implementation == "cudnn" and mask is None and q.shape[1] % 2 == 0 and is_narrow:
+        known = "cudnn"
     return jax.nn.dot_product_attention(q, k, v, mask=keys, is_causal=causal, implementation=known)
 
 
 def usable(model: ModelConfig) -> ModelConfig:
-    """Return `model` with a form of attention that this machine has, for weights trained by
-    cuDNN.
-    """
-    there = model.attention != "cudnn" or jax.default_backend() == "gpu"
-    if there:
-        return model
-    return replace(model, attention="auto")
+    """Return `model` with a form of attention that this machine has, for weights of cuDNN."""
+    if model.attention == "cudnn" and jax.default_backend() != "gpu":
+        return replace(model, attention="auto")
+    return model
 
 
 @jax.custom_vjp
 def mapped(q: Array, k: Array, v: Array) -> Array:
-    """Return attention (B, S, H, D) over a few heads at a time, softmax recomputed backward from
-    its saved log-sum.
+    """Return attention (B, S, H, D), computed for a few heads at a time.
 
     All B * H tables of S x S logits at once are written to memory and read back a dozen times. A
-    few at a time never leave the cache (Rabe and Staats, 2021; Dao et al., 2022). On two CPU cores
-    2 to 4 times as fast.
+    few at a time never leave the cache (Rabe and Staats, 2021; Dao et al., 2022), which is 2 to 4
+    times as fast on two CPU cores. The backward pass recomputes the softmax from its log-sum.
     """
     return _forward(q, k, v)[0]
 
@@ -77,10 +79,13 @@ def _forward(q: Array, k: Array, v: Array) -> tuple[Array, tuple[Array, ...]]:
 
 def _backward(saved: tuple[Array, ...], gradient: Array) -> tuple[Array, Array, Array]:
     *parts, out, log_sum = saved
+    # The softmax's backward pass needs, for each query, the sum over keys of weight times the
+    # gradient of the weight. That is gradient times output, (B, S, H, 1): no table of logits.
     own = jnp.sum(gradient.astype(log_sum.dtype) * out, axis=-1, keepdims=True)
     grads = jax.lax.map(_differentiate, (*parts, log_sum, _groups(own), _groups(gradient)))
-    dq, dk, dv = (_heads(x, gradient.shape) for x in grads)
-    return dq, dk, dv
+    dq, dk, dv = grads
+    shape = gradient.shape
+    return _heads(dq, shape), _heads(dk, shape), _heads(dv, shape)
 
 
 mapped.defvjp(_forward, _backward)
@@ -90,6 +95,7 @@ def _groups(x: Array) -> Array:
     """Reshape (B, S, H, D) to (groups, G, S, D), G heads whose logits fit in `CACHE`."""
     b, s, h, d = x.shape
     most = max(1, CACHE // (4 * s * s))
+    # the largest divisor: lax.map takes groups of one size
     size = next(n for n in range(min(most, b * h), 0, -1) if b * h % n == 0)
     return jnp.swapaxes(x, 1, 2).reshape(b * h // size, size, s, d)
 
@@ -101,10 +107,9 @@ def _heads(x: Array, shape: tuple[int, ...]) -> Array:
 
 
 def _product(subscripts: str, a: Array, b: Array) -> Array:
-    """Return a product of small matrices in the wider of both types, summed in float32 or wider."""
-    return jnp.einsum(
-        subscripts, a, b, preferred_element_type=jnp.promote_types(a.dtype, jnp.float32)
-    )
+    """Return a product of small matrices, summed in float32 or wider."""
+    wide = jnp.promote_types(a.dtype, jnp.float32)
+    return jnp.einsum(subscripts, a, b, preferred_element_type=wide)
 
 
 def _attend(part: tuple[Array, ...]) -> tuple[Array, Array]:
@@ -114,6 +119,7 @@ def _attend(part: tuple[Array, ...]) -> tuple[Array, Array]:
     largest = jnp.max(logits, axis=-1, keepdims=True)
     weights = jnp.exp(logits - largest)
     total = jnp.sum(weights, axis=-1, keepdims=True)
+    # Divided after the product: D numbers a query instead of S.
     out = _product("gqk,gkd->gqd", weights.astype(v.dtype), v) / total
     return out.astype(v.dtype), (largest + jnp.log(total))[..., 0]
 
@@ -127,7 +133,9 @@ def _differentiate(part: tuple[Array, ...]) -> tuple[Array, Array, Array]:
     scale = q.shape[-1] ** -0.5
     weights = jnp.exp(_product("gqd,gkd->gqk", q * scale, k) - log_sum[..., None])
     dv = _product("gqk,gqd->gkd", weights.astype(v.dtype), gradient)
-    dlogits = (weights * (_product("gqd,gkd->gqk", gradient, v) - own)).astype(q.dtype)
+    # d softmax: weight * (gradient of the weight - its mean under the weights)
+    dweights = _product("gqd,gkd->gqk", gradient, v)
+    dlogits = (weights * (dweights - own)).astype(q.dtype)
     dq = _product("gqk,gkd->gqd", dlogits, k) * scale
     dk = _product("gqk,gqd->gkd", dlogits, q * scale)
     return dq.astype(q.dtype), dk.astype(k.dtype), dv.astype(v.dtype)

@@ -1,6 +1,4 @@
-"""Image and text towers of CLIP (Radford et al., 2021), for stage 2, and LoRA of the image
-tower.
-"""
+"""CLIP's image and text towers (Radford et al., 2021) for stage 2, and LoRA of the image tower."""
 
 from __future__ import annotations
 
@@ -43,9 +41,8 @@ class ImageTower(nnx.Module):
     def hidden(self, image: Array) -> Array:
         """Return the last hidden states (V, 1 + N, D) of normalised images (V, H, W, 3)."""
         x = self.patch(tokens.patchify(image[:, None], self.patch_size)[:, :, 0])
-        start = jnp.broadcast_to(
-            self.class_token[...].astype(x.dtype)[None, None], (len(x), 1, x.shape[-1])
-        )
+        class_token = self.class_token[...].astype(x.dtype)[None, None]
+        start = jnp.broadcast_to(class_token, (len(x), 1, x.shape[-1]))
         x = jnp.concatenate([start, x], axis=1) + self.position[...].astype(x.dtype)[None]
         return run_blocks(self.blocks, self.pre_norm(x), remat=self.remat)
 
@@ -59,7 +56,10 @@ class ImageTower(nnx.Module):
 
 
 class TextEncoder(nnx.Module):
-    """Causal transformer over token ids, with the embedding from the end token (golden Q10)."""
+    """Causal transformer over token ids, with the embedding from the end token.
+
+    CLIP pads with the end token too, which is the largest id: the first one is pooled.
+    """
 
     def __init__(self, model: ModelConfig, tower: TextTower) -> None:
         width = tower.stack.width
@@ -75,19 +75,25 @@ class TextEncoder(nnx.Module):
         self.remat = model.remat
 
     def hidden(self, ids: Array, mask: Array | None = None) -> Array:
-        """Return normed hidden states (L, S, W) of token ids (L, S); `mask` (L, S) bool, True on
-        readable tokens.
+        """Return normed hidden states (L, S, W) of token ids (L, S).
+
+        `mask` bool (L, S) is True on readable tokens.
         """
-        x = (rows_of(self.token[...], ids) + self.position[...][None, : ids.shape[1]]).astype(
-            self.dtype
-        )
-        return self.final_norm(run_blocks(self.blocks, x, remat=self.remat, causal=True, mask=mask))
+        position = self.position[...][None, : ids.shape[1]]
+        x = (rows_of(self.token[...], ids) + position).astype(self.dtype)
+        x = run_blocks(self.blocks, x, remat=self.remat, causal=True, mask=mask)
+        return self.final_norm(x)
 
     def pooled(self, ids: Array, mask: Array | None = None) -> Array:
-        """Return the hidden state (L, W) of the end token: the largest id, or the first occurrence
-        of `end_token`.
+        """Return the hidden state (L, W) of the end token, at its first place.
+
+        It is the largest id, or `end_token`.
         """
-        at = jnp.argmax(ids if self.end_token is None else ids == self.end_token, axis=1)
+        # argmax gives the first of equal ones
+        if self.end_token is None:
+            at = jnp.argmax(ids, axis=1)
+        else:
+            at = jnp.argmax(ids == self.end_token, axis=1)
         return jnp.take_along_axis(self.hidden(ids, mask), at[:, None, None], axis=1)[:, 0]
 
     def __call__(self, ids: Array, mask: Array | None = None) -> Array:
@@ -104,19 +110,21 @@ class Lora(nnx.Module):
 
 
 def merge_lora(params: Params, alpha: float) -> Params:
-    """Return `params` with W + alpha / r * A B for the image tower's q, k, v and output kernels W
-    (Hu et al., 2022).
+    """Return `params` with LoRA merged into the image tower's attention (Hu et al., 2022).
 
-    Without a "lora" entry the tree is unchanged. The update is linear, so adding it to the kernel
-    gives the output and the gradient of applying it to the activations.
+    Its q, k, v and output kernels W become W + alpha / r * A B. Without a "lora" entry the tree is
+    unchanged.
     """
     if "lora" not in params:
         return params
-    attention = dict(params["image"]["blocks"]["attention"])
+    # The update is linear, so adding it to the kernel gives the output and the gradient of applying
+    # it to the activations, and costs a product of D x r x D instead of two over all tokens.
+    blocks = params["image"]["blocks"]
+    attention = dict(blocks["attention"])
     for name, factors in params["lora"].items():
-        update = jnp.einsum("ldr,lre->lde", factors["a"], factors["b"]) * (
-            alpha / factors["a"].shape[-1]
-        )
+        rank = factors["a"].shape[-1]
+        update = jnp.einsum("ldr,lre->lde", factors["a"], factors["b"]) * (alpha / rank)
         attention[name] = attention[name] | {"kernel": attention[name]["kernel"] + update}
-    image = params["image"] | {"blocks": params["image"]["blocks"] | {"attention": attention}}
-    return {name: value for name, value in params.items() if name != "lora"} | {"image": image}
+    image = params["image"] | {"blocks": blocks | {"attention": attention}}
+    others = {name: value for name, value in params.items() if name != "lora"}
+    return others | {"image": image}

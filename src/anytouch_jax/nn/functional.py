@@ -19,8 +19,8 @@ from flax import nnx
 from jax import Array
 from jax.typing import DTypeLike
 
+from anytouch_jax.batch import FieldOutput
 from anytouch_jax.config import ModelConfig
-from anytouch_jax.fields.module import FieldOutput
 from anytouch_jax.nn.anytouch import AnyTouch
 from anytouch_jax.nn.clip import merge_lora
 from anytouch_jax.ops import losses, tokens
@@ -41,8 +41,9 @@ class Net:
     model: ModelConfig
 
     def init(self, key: Array) -> Params:
-        """Return fresh float32 parameters, drawn on the host from a PRNG key: equal on every device
-        and version.
+        """Return fresh float32 parameters, drawn from a PRNG key.
+
+        They are drawn on the host, so they are equal on every device and version of jax.
         """
         return _drawn(self.abstract(), self.model, key)
 
@@ -51,10 +52,10 @@ class Net:
         return nnx.to_pure_dict(_skeleton(AnyTouch, self.model)[1])
 
     def bind(self, params: Params) -> AnyTouch:
-        """Return the module with these parameters, for parts without a method here
-        (`net.bind(params).touch`).
+        """Return the module with these parameters, for parts without a method here.
 
-        A "lora" entry is merged into the image tower.
+        `net.bind(params).touch` is the touch encoder. A "lora" entry is merged into the image
+        tower.
         """
         params = merge_lora(jax.tree.map(jnp.asarray, params), self.model.lora_alpha)
         return _with(params, *_skeleton(AnyTouch, replace(self.model, lora_rank=0)))
@@ -67,29 +68,32 @@ class Net:
         join: str = "mean",
         keep_ids: Array | None = None,
     ) -> Array:
-        """Return touch embeddings (B, E) of normalised clips (B, T, H, W, 3), from the class token;
-        not unit-norm.
+        """Return touch embeddings (B, E) from the class token, not unit-norm.
 
-        With `keep_ids` (B, K) only these patches are encoded, of stills (T = 1) and of clips of
-        `frames` frames. A longer clip is cut into segments whose features are averaged
-        (join="mean"), summed ("sum") or concatenated ("concat": (B, segments * E)) (App.
-        "Discussion on frame number").
+        Args:
+            params: Parameters of the network.
+            clip: Normalised pixels, float (B, T, H, W, 3).
+            sensor: Rows of the token table, i32 (B,).
+            join: A clip longer than `frames` is cut into segments (appendix, "Discussion on frame
+                number"). Their features are averaged ("mean"), summed ("sum") or concatenated
+                ("concat", which gives (B, segments * E)).
+            keep_ids: Patches to encode (B, K), of stills and of clips of `frames` frames. None
+                encodes all.
         """
         return self.bind(params).encode_touch(clip, sensor, join, keep_ids)
 
     def encode_poolings(
         self, params: Params, clip: Array, sensor: Array, join: str = "mean"
     ) -> tuple[Array, Array]:
-        """Return both poolings (B, E) in one pass: the class token and the mean over patch
-        tokens.
-        """
+        """Return both poolings (B, E) in one pass: class token, and mean over patch tokens."""
         return self.bind(params).encode_poolings(clip, sensor, join)
 
     def encode_tokens(
         self, params: Params, clip: Array, sensor: Array, keep_ids: Array | None = None
     ) -> Array:
-        """Return the projected sequence (B, 1 + S + K, E) of class, sensor and patch tokens: the
-        decoder's input.
+        """Return the projected sequence (B, 1 + S + K, E), the decoder's input.
+
+        It is [class, sensor tokens, patches].
         """
         return self.bind(params).encode_tokens(clip, sensor, keep_ids)
 
@@ -103,18 +107,26 @@ class Net:
         frames: int,
         decoder_sensor: Array | None = None,
     ) -> Array:
-        """Return pixels (B, N, frames, P*P*3) of every position from the visible patches `keep_ids`
-        (B, K).
+        """Return pixels (B, N, frames, P*P*3) of every position from the visible patches.
+
+        Args:
+            params: Parameters of the network.
+            clip: Normalised pixels, float (B, T, H, W, 3), without the next frame.
+            sensor: Rows of the token table, i32 (B,).
+            keep_ids: The visible patches (B, K).
+            restore_ids: The place (B, N) of each position in [visible, hidden].
+            frames: Frames to predict: 1 of a still, 3 of a clip, 4 with the next frame.
+            decoder_sensor: Rows i32 (B,) of the tokens that the decoder of the release gets.
         """
         return self.bind(params).reconstruct(
             clip, sensor, keep_ids, restore_ids, frames, decoder_sensor
         )
 
     def measure(self, params: Params, clip: Array, sensor: Array, aspect: Array) -> FieldOutput:
-        """Return depth, shear, contact and force of normalised clips (B, T, H, W, 3), see
-        `nn.fields`.
+        """Return depth, shear, contact and force of normalised clips (B, T, H, W, 3).
 
-        `aspect` (B,) is the logarithm of the height over the width that the picture shows.
+        `aspect` (B,) is the logarithm of the height over the width that the image shows. The
+        result is free of scale.
         """
         return self.bind(params).measure(clip, sensor, aspect)
 
@@ -139,9 +151,10 @@ class Net:
     def scale(self, params: Params) -> Array:
         """Return 1 / tau f32 (), the learned factor on cosine similarities (Eq. 3): 100 at most."""
         log = self.bind(params).logit_scale[...]
-        return jnp.exp(
-            log + jax.lax.stop_gradient(jnp.minimum(log, math.log(losses.MOST_SCALE)) - log)
-        )
+        # Clipped by a straight-through term: the gradient stays that of exp, so a scale beyond 100
+        # can fall again. CLIP clips the parameter after each step instead.
+        clipped = jnp.minimum(log, math.log(losses.MOST_SCALE))
+        return jnp.exp(log + jax.lax.stop_gradient(clipped - log))
 
 
 def build(model: ModelConfig) -> Net:
@@ -169,16 +182,19 @@ class Part:
 
     def apply(self, params: Params, *args: Any) -> Any:
         """Call the module."""
-        return _with(jax.tree.map(jnp.asarray, params), *_skeleton(self.kind, self.options))(*args)
+        graph, state = _skeleton(self.kind, self.options)
+        return _with(jax.tree.map(jnp.asarray, params), graph, state)(*args)
 
 
 def _skeleton(kind: Callable[[Any], Any], options: Any) -> tuple[Any, Any]:
-    """Return graph and abstract state of a module, whose parameters have the widest float of the
-    context.
+    """Return graph and abstract state of a module.
+
+    Parameters have the widest float of the context: float64 while jax_enable_x64 is set.
     """
     return _cached_skeleton(kind, options, jax.dtypes.canonicalize_dtype(float))
 
 
+# Cached, because every call of `bind` needs it.
 @lru_cache(maxsize=24)
 def _cached_skeleton(kind: Callable[[Any], Any], options: Any, _: DTypeLike) -> tuple[Any, Any]:
     return nnx.split(nnx.eval_shape(lambda: kind(options)))
@@ -204,6 +220,7 @@ def _first_value(
     name = "/".join(entry.key for entry in path)
     shape = leaf.shape
     last = name.rsplit("/", 1)[-1]
+    # A stream for each name: a new parameter changes no other, and the order does not matter.
     rng = np.random.default_rng([*seed, zlib.crc32(name.encode())])
     if name == "logit_scale":
         value = -np.log(model.temperature)
@@ -215,10 +232,17 @@ def _first_value(
         value = np.ones(shape)
     elif last in ("bias", "b"):  # b: LoRA starts as no change
         value = np.zeros(shape)
-    elif last == "kernel":  # Xavier uniform, as MAE; the touch kernel's inputs span its frames
-        inputs = shape[-2] * (shape[-3] if name == "touch/patch/kernel" else 1)
+    elif last == "kernel":
+        # Xavier uniform, as MAE. The inputs of the touch kernel span its frames.
+        inputs = shape[-2]
+        if name == "touch/patch/kernel":
+            inputs = inputs * shape[-3]
         value = rng.uniform(-1, 1, shape) * np.sqrt(6 / (inputs + shape[-1]))
-    else:  # tokens and positions; LoRA's a
-        value = rng.standard_normal(shape) * (shape[-2] ** -0.5 if last == "a" else 0.02)
+    elif last == "a":
+        # LoRA's other factor: of the size that an input of the layer keeps.
+        value = rng.standard_normal(shape) * shape[-2] ** -0.5
+    else:
+        # Tokens and positions, as CLIP and MAE.
+        value = rng.standard_normal(shape) * 0.02
     # jnp.asarray would compile a program for each shape
     return jax.device_put(np.asarray(value, leaf.dtype))

@@ -1,6 +1,4 @@
-"""Matrix products, attention, MLP, pre-norm block and a scanned stack of blocks, shared by all
-towers.
-"""
+"""Layers that all towers share: products, attention, MLP, pre-norm block, scanned stacks."""
 
 from __future__ import annotations
 
@@ -24,24 +22,25 @@ Turn = Callable[[Array], Array]
 
 
 def stored(dtype: DTypeLike) -> jnp.dtype:
-    """Return the type of arrays between the products of a model of `dtype`: float32 for 16 bits on
-    a CPU.
+    """Return the type of arrays between the products of a model of `dtype`.
 
-    A CPU has 16-bit products (AMX) and nothing else of 16 bits: XLA would widen every sum, norm and
-    copy, and each write into a slice would widen the whole array.
+    It is float32 for 16 bits on a CPU, which has 16-bit products (AMX) and nothing else of 16 bits:
+    XLA would widen every sum, norm and copy, and each write into a slice would widen the whole
+    array.
     """
     narrow = jnp.dtype(dtype).itemsize == 2 and jax.default_backend() == "cpu"
     return jnp.dtype(jnp.float32 if narrow else dtype)
 
 
 def product(x: Array, kernel: Array, dtype: DTypeLike) -> Array:
-    """Return x (rows, inputs) @ kernel (inputs, outputs), both rounded to `dtype`, as
-    `stored(dtype)`.
+    """Return x (rows, inputs) @ kernel (inputs, outputs) as `stored(dtype)`.
+
+    Both operands are rounded to `dtype`.
     """
     if stored(dtype) != dtype:
-        return checkpoint_name(
-            _narrow(x.astype(stored(dtype)), kernel, jnp.dtype(dtype)), "product"
-        )
+        # Named, because jax.checkpoint does not see that a custom_vjp is a product.
+        narrow = _narrow(x.astype(stored(dtype)), kernel, jnp.dtype(dtype))
+        return checkpoint_name(narrow, "product")
     return x.astype(dtype) @ kernel.astype(dtype)
 
 
@@ -66,10 +65,16 @@ def _forward(x: Array, kernel: Array, dtype: DTypeLike) -> tuple[Array, tuple[Ar
 
 
 def _backward(dtype: DTypeLike, saved: tuple[Array, Array], gradient: Array) -> tuple[Array, Array]:
-    x, kernel, g = (part.astype(dtype) for part in (*saved, gradient))
-    if x.shape[1] <= g.shape[1]:  # transpose the narrower of the two
-        return _wide(g, kernel, 1), _wide(_turned(x), g, 0)
-    return _wide(g, kernel, 1), _turned(_wide(_turned(g), x, 0))
+    x, kernel = saved
+    x = x.astype(dtype)
+    kernel = kernel.astype(dtype)
+    g = gradient.astype(dtype)
+    dx = _wide(g, kernel, 1)
+    # dkernel = x^T g needs a transpose, because the fast form contracts the last axis of its first
+    # operand. The narrower of the two is transposed: it is less to copy.
+    if x.shape[1] <= g.shape[1]:
+        return dx, _wide(_transposed(x), g, 0)
+    return dx, _transposed(_wide(_transposed(g), x, 0))
 
 
 _narrow.defvjp(_forward, _backward)
@@ -80,25 +85,27 @@ def _wide(a: Array, b: Array, axis: int) -> Array:
     return lax.dot_general(a, b, (((1,), (axis,)), ((), ())), preferred_element_type=jnp.float32)
 
 
-def _turned(x: Array) -> Array:
-    """Return x^T as a copy.
-
-    The branch keeps XLA from folding it into the product. NaN stays NaN.
-    """
+def _transposed(x: Array) -> Array:
+    """Return x^T as a copy."""
     if not x.size:
         return x.T
-    return lax.cond(
-        x[0, 0] < jnp.inf, lambda x: x.T, lambda x: jnp.full(x.shape[::-1], jnp.nan, x.dtype), x
-    )
+
+    def not_finite(x: Array) -> Array:
+        return jnp.full(x.shape[::-1], jnp.nan, x.dtype)
+
+    # XLA would fold a plain transpose into the product, which then takes its slow form. It cannot
+    # fold a branch. The condition holds for every finite x, and NaN stays NaN.
+    return lax.cond(x[0, 0] < jnp.inf, lambda x: x.T, not_finite, x)
 
 
 @jax.custom_vjp
 def gelu(x: Array) -> Array:
-    """Exact GELU, x * Phi(x), as CLIP and ViT use it (jax.nn.gelu defaults to the tanh form).
+    """Return exact GELU, x * Phi(x), as CLIP and ViT use it.
 
-    The derivative is written by hand: tracing jax's erfc form costs 2.5 times as much on a CPU. In
-    float32 at least: 1 + erf in 16 bits has nothing left of the negative tail.
+    jax.nn.gelu defaults to the tanh form. The derivative is written by hand, because tracing jax's
+    erfc form costs 2.5 times as much on a CPU.
     """
+    # In float32 at least: 1 + erf in 16 bits has nothing left of the negative tail.
     wide = x.astype(jnp.promote_types(x.dtype, jnp.float32))
     return (wide * _normal_cdf(wide)).astype(x.dtype)
 
@@ -113,6 +120,7 @@ def _gelu_forward(x: Array) -> tuple[Array, Array]:
 
 def _gelu_backward(x: Array, g: Array) -> tuple[Array]:
     wide = x.astype(jnp.promote_types(x.dtype, jnp.float32))
+    # Phi(x) + x phi(x), with phi the density of the normal distribution
     slope = _normal_cdf(wide) + wide * 0.3989422804014327 * jnp.exp(-0.5 * wide * wide)
     return ((g * slope).astype(x.dtype),)
 
@@ -121,7 +129,7 @@ gelu.defvjp(_gelu_forward, _gelu_backward)
 
 
 def quick_gelu(x: Array) -> Array:
-    """x * sigmoid(1.702 x), the activation of OpenAI's CLIP weights."""
+    """Return x * sigmoid(1.702 x), the activation of OpenAI's CLIP weights."""
     return x * jax.nn.sigmoid(1.702 * x)
 
 
@@ -139,16 +147,16 @@ def table(*shape: int) -> nnx.Param:
 def rows_of(values: Array, ids: Array) -> Array:
     """Return rows of a table (R, ...) by ids of any shape.
 
-    An id outside it gives NaN, which the step reports.
-
-    JAX alone would take the nearest row, or count from the end.
+    An id outside it gives NaN, which the step reports. JAX alone would take the nearest row, or
+    count from the end.
     """
     return values.at[ids].get(mode="fill", fill_value=jnp.nan, wrap_negative_indices=False)
 
 
 class Dense(nnx.Module):
-    """A linear layer (..., inputs) -> (..., outputs): float32 parameters, arithmetic in the model's
-    dtype.
+    """A linear layer (..., inputs) -> (..., outputs).
+
+    Its parameters are float32, and its arithmetic is in the model's dtype.
     """
 
     def __init__(self, inputs: int, outputs: int, model: ModelConfig, *, bias: bool = True) -> None:
@@ -161,7 +169,8 @@ class Dense(nnx.Module):
         # As a matrix: of two contracted axes XLA's CPU back end writes a transposed copy before the
         # gradient's product.
         y = product(x.reshape(-1, x.shape[-1]), self.kernel[...][:, :outputs], self.dtype)
-        y = y if self.bias is None else y + self.bias[...][None, :outputs].astype(y.dtype)
+        if self.bias is not None:
+            y = y + self.bias[...][None, :outputs].astype(y.dtype)
         return y.reshape(*x.shape[:-1], y.shape[-1])
 
 
@@ -178,7 +187,9 @@ class LayerNorm(nnx.Module):
         wide = x.astype(jnp.promote_types(x.dtype, jnp.float32))
         centred = wide - row_sums(wide) / wide.shape[-1]
         variance = row_sums(centred * centred) / wide.shape[-1]
-        scale, bias = (jnp.expand_dims(p[...], range(x.ndim - 1)) for p in (self.scale, self.bias))
+        # Leading axes by hand: tests run with jax_numpy_rank_promotion="raise".
+        scale = jnp.expand_dims(self.scale[...], range(x.ndim - 1))
+        bias = jnp.expand_dims(self.bias[...], range(x.ndim - 1))
         return (centred * jax.lax.rsqrt(variance + self.eps) * scale + bias).astype(self.dtype)
 
 
@@ -186,19 +197,20 @@ class Attention(nnx.Module):
     """Multi-head attention of (B, Q, D) over (B, S, D): `project`, `attend` and `out`."""
 
     def __init__(self, stack: Stack, model: ModelConfig) -> None:
-        self.query, self.key, self.value, self.out = (
-            Dense(stack.width, stack.width, model) for _ in range(4)
-        )
+        self.query = Dense(stack.width, stack.width, model)
+        self.key = Dense(stack.width, stack.width, model)
+        self.value = Dense(stack.width, stack.width, model)
+        self.out = Dense(stack.width, stack.width, model)
         self.heads = stack.heads
         self.implementation = model.attention
 
     def project(self, asks: Array, x: Array) -> tuple[Array, Array, Array]:
         """Return q (B, Q, H, D / H) and k, v (B, S, H, D / H)."""
-        parts = (self.query(asks), self.key(x), self.value(x))
-        q, k, v = (
-            part.reshape(*part.shape[:2], self.heads, part.shape[2] // self.heads) for part in parts
-        )
-        return q, k, v
+
+        def cut(part: Array) -> Array:
+            return part.reshape(*part.shape[:2], self.heads, part.shape[2] // self.heads)
+
+        return cut(self.query(asks)), cut(self.key(x)), cut(self.value(x))
 
     def attend(self, q: Array, k: Array, v: Array, *, causal: bool, mask: Array | None) -> Array:
         """Return (B, Q, H, D / H). `mask` (B, S) bool marks the keys to read."""
@@ -237,7 +249,9 @@ class Block(nnx.Module):
         self, x: Array, *, causal: bool = False, mask: Array | None = None, turn: Turn | None = None
     ) -> Array:
         q, k, v = self._before(x)
-        q, k = (q, k) if turn is None else (turn(q), turn(k))
+        if turn is not None:
+            q = turn(q)
+            k = turn(k)
         return self._after(x, self.attention.attend(q, k, v, causal=causal, mask=mask))
 
     def first(self, x: Array) -> Array:
@@ -246,13 +260,15 @@ class Block(nnx.Module):
         Other tokens need only keys and values.
         """
         one = x[:, :1]
-        heads = self.attention.attend(*self._before(x, one), causal=False, mask=None)
+        q, k, v = self._before(x, one)
+        heads = self.attention.attend(q, k, v, causal=False, mask=None)
         return self._after(one, heads)[:, 0]
 
     @lean
     def _before(self, x: Array, asks: Array | None = None) -> tuple[Array, Array, Array]:
         normed = self.norm1(x)
-        return self.attention.project(normed if asks is None else self.norm1(asks), normed)
+        asking = normed if asks is None else self.norm1(asks)
+        return self.attention.project(asking, normed)
 
     @lean
     def _after(self, x: Array, heads: Array) -> Array:
@@ -276,16 +292,24 @@ def run_blocks(
     mask: Array | None = None,
     turn: Turn | None = None,
 ) -> Array:
-    """Send `x` (B, S, D) through stacked blocks by lax.scan, so that compile time does not grow
-    with depth.
+    """Send `x` (B, S, D) through stacked blocks, (B, S, D).
 
-    `turn` changes queries and keys (B, S, H, D / H) in each block, by their places.
+    It is a lax.scan, so that compile time does not grow with depth.
+
+    Args:
+        blocks: What `stacked_blocks` returns.
+        x: The first block's input.
+        remat: Recompute activations in the backward pass.
+        causal: Whether a token reads those up to its own place only.
+        mask: Tokens to read, bool (B, S). None: all.
+        turn: Changes queries and keys (B, S, H, D / H) in each block, by their places.
     """
 
     def body(x: Array, block: Block) -> Array:
         return block(x, causal=causal, mask=mask, turn=turn)
 
-    body = nnx.remat(body) if remat else body
+    if remat:
+        body = nnx.remat(body)
     return nnx.scan(body, in_axes=(nnx.Carry, 0), out_axes=nnx.Carry)(x, blocks)
 
 
@@ -298,8 +322,11 @@ def read_blocks(blocks: Block, x: Array, *, remat: bool) -> Array:
     def end(x: Array, block: Block) -> Array:
         return block.first(x)
 
-    x = _but_last(blocks, x, remat) if _depth(blocks) > 1 else x
-    return (nnx.remat(end) if remat else end)(x, jax.tree.map(lambda values: values[-1], blocks))
+    if _depth(blocks) > 1:
+        x = _but_last(blocks, x, remat)
+    if remat:
+        end = nnx.remat(end)
+    return end(x, jax.tree.map(lambda values: values[-1], blocks))
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(2,))
@@ -315,12 +342,16 @@ def _but_last(blocks: Block, x: Array, remat: bool) -> Array:
         )
         return block(x), None
 
-    # an export's batch is a symbol
     steps = _depth(blocks) - 1
+    # the batch of an export is a symbol, not an int
     is_one = isinstance(x.shape[0], int) and x.shape[0] == 1
-    # One touch by few blocks: with constant parameters nothing is taken out of the stack, and it
-    # takes a tenth less.
-    return jax.lax.scan(body, x, jnp.arange(steps), unroll=steps if is_one and steps < 12 else 1)[0]
+    unroll = 1
+    if is_one and steps < 12:
+        # One touch by few blocks: with constant parameters nothing is taken out of the stack, and
+        # it takes a tenth less.
+        unroll = steps
+    last, _ = jax.lax.scan(body, x, jnp.arange(steps), unroll=unroll)
+    return last
 
 
 def _but_last_forward(blocks: Block, x: Array, remat: bool) -> Any:

@@ -29,14 +29,16 @@ from anytouch_jax.ops import tokens
 class TouchPatch(nnx.Module):
     """Patch projection of stills and clips: one kernel a frame, (frames, P*P*3, D), no bias.
 
-    It is shared by all sensors, or each row of the sensor table has its own, (rows, frames, P*P*3,
-    D).
+    It is shared by all sensors, or each row of the sensor table has its own: then the kernel is
+    (rows, frames, P*P*3, D).
     """
 
     def __init__(self, model: ModelConfig) -> None:
-        rows = (len(model.sensors),) if model.patch_encoder == "sensor" else ()
-        self.kernel = table(*rows, model.frames, model.patch**2 * 3, model.touch.width)
-        self.own = bool(rows)
+        shape = [model.frames, model.patch**2 * 3, model.touch.width]
+        self.own = model.patch_encoder == "sensor"
+        if self.own:
+            shape.insert(0, len(model.sensors))
+        self.kernel = table(*shape)
         self.dtype = jnp.dtype(model.dtype)
 
     def __call__(self, patches: Array, sensor: Array) -> Array:
@@ -46,11 +48,14 @@ class TouchPatch(nnx.Module):
         """
         kernel = self.kernel[...]
         if patches.shape[2] == 1:
+            # The product is linear, so equal frames need one projection by the sum of the kernels
+            # instead of three.
             kernel = reduce(jnp.add, jnp.moveaxis(kernel, -3, 0))[..., None, :, :]
         if not self.own:
             matrix = kernel.reshape(-1, kernel.shape[-1])
             x = product(patches.reshape(-1, len(matrix)), matrix, self.dtype)
             return x.reshape(*patches.shape[:2], kernel.shape[-1])
+        # One kernel a sample (T3): the batch has several sensors.
         each = rows_of(kernel, sensor)
         own = stored(self.dtype)
         return jnp.einsum("bktc,btcd->bkd", patches.astype(own), each.astype(own))
@@ -79,24 +84,22 @@ class TouchEncoder(nnx.Module):
     def tokens(self, clip: Array, sensor: Array, keep_ids: Array | None = None) -> Array:
         """Return the input sequence (B, 1 + S + K, D), before the first norm.
 
-        Hidden patches are never projected.
+        With `keep_ids` (B, K) the others are hidden, and never projected.
         """
+        batch = clip.shape[0]
         patches = tokens.patchify(clip, self.patch_size)
-        position = jnp.broadcast_to(
-            self.position[...][None, 1:], (clip.shape[0], *self.position[...][1:].shape)
-        )
+        table = self.position[...]
+        position = jnp.broadcast_to(table[None, 1:], (batch, *table[1:].shape))
         if keep_ids is not None:
             patches = tokens.keep(patches, keep_ids)
             position = tokens.keep(position, keep_ids)
         x = self.patch(patches, sensor)
-        start = jnp.broadcast_to(
-            (self.class_token[...] + self.position[...][0])[None, None],
-            (clip.shape[0], 1, x.shape[-1]),
-        )
+        first = (self.class_token[...] + table[0])[None, None]
+        start = jnp.broadcast_to(first, (batch, 1, x.shape[-1]))
+        # Sensor tokens have no position: they belong to the whole image (Sec. 3.5).
         own = rows_of(self.sensor_tokens[...], sensor)
-        return jnp.concatenate(
-            [start.astype(x.dtype), own.astype(x.dtype), x + position.astype(x.dtype)], axis=1
-        )
+        parts = [start.astype(x.dtype), own.astype(x.dtype), x + position.astype(x.dtype)]
+        return jnp.concatenate(parts, axis=1)
 
     def _first(self, clip: Array, sensor: Array, keep_ids: Array | None = None) -> Array:
         x = self.tokens(clip, sensor, keep_ids)
@@ -110,43 +113,40 @@ class TouchEncoder(nnx.Module):
         return run_blocks(self.blocks, x, remat=self.remat)
 
     def states(self, clip: Array, sensor: Array, count: int) -> Array:
-        """Return `count` hidden states, evenly spaced from the first block's input to the last
-        block's output.
+        """Return `count` hidden states, evenly spaced over the depth of the encoder.
 
-        They are concatenated: (B, 1 + S + N, count * D). A count of 1 gives the last state (DPT,
-        Ranftl et al. 2021).
+        The first is the first block's input, the last the last block's output. They are
+        concatenated: (B, 1 + S + N, count * D). A count of 1 gives the last state (DPT, Ranftl et
+        al. 2021).
         """
         x = self._first(clip, sensor)
         states = []
         before = 0
         for number in range(count):
-            block = round(number * self.depth / (count - 1)) if count > 1 else self.depth
-            x = (
-                run_blocks(blocks_between(self.blocks, before, block), x, remat=self.remat)
-                if block > before
-                else x
-            )
+            block = self.depth
+            if count > 1:
+                block = round(number * self.depth / (count - 1))
+            if block > before:
+                between = blocks_between(self.blocks, before, block)
+                x = run_blocks(between, x, remat=self.remat)
             states.append(x)
             before = block
         return jnp.concatenate(states, axis=-1)
 
     def features(self, clip: Array, sensor: Array, keep_ids: Array | None = None) -> Array:
-        """Return the touch embedding (B, E) of all patches or of `keep_ids` (B, K), not
-        normalised.
-        """
+        """Return the touch embedding (B, E), not normalised, of all patches or of `keep_ids`."""
         x = self._first(clip, sensor, keep_ids)
         return self.embedding(read_blocks(self.blocks, x, remat=self.remat))
 
     def embedding(self, token: Array) -> Array:
-        """Return the touch embedding (B, E) from the last hidden state of the class token (B,
-        D).
-        """
+        """Return the touch embedding (B, E) of the class token's last hidden state (B, D)."""
         return self.projection(self.post_norm(token))
 
 
 class TouchDecoder(nnx.Module):
-    """Light ViT that predicts every position from the visible ones, with a head for stills and one
-    for clips.
+    """Light ViT that predicts every position from the visible ones (He et al., 2022).
+
+    It has a head for stills and one for clips, whose last frame is the next one.
     """
 
     def __init__(self, model: ModelConfig) -> None:
@@ -159,6 +159,7 @@ class TouchDecoder(nnx.Module):
         self.norm = LayerNorm(width, model.decoder_norm_eps, model.dtype)
         self.still_head = Dense(width, pixels, model)
         self.clip_head = Dense(width, pixels * (model.frames + 1), model)
+        self.takes_sensor_tokens = model.decoder_sensor_tokens
         if model.decoder_sensor_tokens:
             self.sensor_projection = Dense(model.touch.width, width, model, bias=False)
         self.special = 1 + model.sensor_tokens
@@ -167,22 +168,25 @@ class TouchDecoder(nnx.Module):
     def __call__(
         self, latent: Array, restore_ids: Array, frames: int, sensor_tokens: Array | None = None
     ) -> Array:
-        """Return pixels (B, N, frames, P*P*3) of (B, 1 + S + K, E).
+        """Return pixels (B, N, frames, P*P*3) of every position.
 
-        `sensor_tokens` (B, S, D) replace encoded ones.
+        Args:
+            latent: The projected sequence (B, 1 + S + K, E) of [class, sensor tokens, patches].
+            restore_ids: The place (B, N) of each position in [visible, hidden].
+            frames: 1 for a still, 3 for a clip, 4 with the next frame.
+            sensor_tokens: Tokens (B, S, D) before encoding, which replace the encoded ones as in
+                the release. None keeps those.
         """
         x = self.embed(latent)
         position = self.position[...].astype(x.dtype)
         start = x[:, :1] + position[None, :1]
-        own = (
-            x[:, 1 : self.special]
-            if sensor_tokens is None
-            else self.sensor_projection(sensor_tokens)
-        )
-        grid = (
-            tokens.restore(x[:, self.special :], self.mask_token[...], restore_ids)
-            + position[None, 1:]
-        )
+        own = x[:, 1 : self.special]
+        if sensor_tokens is not None:
+            own = self.sensor_projection(sensor_tokens)
+        # Every position is there again, the hidden ones as one learned token. So the position
+        # is all that tells two of them apart.
+        grid = tokens.restore(x[:, self.special :], self.mask_token[...], restore_ids)
+        grid = grid + position[None, 1:]
         x = jnp.concatenate([start, own, grid], axis=1)
         x = self.norm(run_blocks(self.blocks, x, remat=self.remat))[:, self.special :]
         return self.pixels(x, frames)
@@ -194,5 +198,8 @@ class TouchDecoder(nnx.Module):
         """
         if frames == 1:
             return self.still_head(x)[:, :, None]
+        # The outputs of the clip head are in the order of the frames, so the first columns of its
+        # kernel are enough where there is no next frame.
         size = self.still_head.kernel.shape[1]
-        return self.clip_head(x, outputs=frames * size).reshape(*x.shape[:2], frames, size)
+        pixels = self.clip_head(x, outputs=frames * size)
+        return pixels.reshape(*x.shape[:2], frames, size)

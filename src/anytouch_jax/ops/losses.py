@@ -23,7 +23,8 @@ MOST_SCALE = 100.0  # 1 / tau, as CLIP (Radford et al., 2021, Sec. 2.5)
 def _wide(*values: ArrayLike) -> list[Array]:
     """Return arrays of one float type: float64 if a value has it, else float32.
 
-    A Python number has no type.
+    So 16-bit embeddings have a loss of 32 bits. A Python number has no type of its own, although
+    jnp.asarray gives it one.
     """
     arrays = [jnp.asarray(value) for value in values]
     pairs = zip(values, arrays, strict=True)
@@ -33,40 +34,37 @@ def _wide(*values: ArrayLike) -> list[Array]:
 
 def mean(values: Array, count: Array | int | None = None) -> Array:
     """Return the sum of `values` over their number or `count`. That of nothing is 0."""
-    count = values.size if count is None else count
+    if count is None:
+        count = values.size
     return jnp.sum(values) / jnp.maximum(jnp.asarray(count, values.dtype), 1)
 
 
 def row_sums(x: Array) -> Array:
-    """Return the sums (..., 1) of x (..., N) over its last axis.
-
-    On a CPU it is a product with ones. XLA fuses what makes `x` into a product, but writes `x` to
-    memory for a sum.
-    """
+    """Return the sums (..., 1) of x (..., N) over its last axis."""
     if jax.default_backend() != "cpu":
         return jnp.sum(x, axis=-1, keepdims=True)
+    # On a CPU as a product with ones: XLA fuses what makes `x` into a product, but writes `x` to
+    # memory for a sum. LayerNorm and the norms of gradients are bound by memory.
     rows = x.reshape(math.prod(x.shape[:-1]), x.shape[-1])
-    return jnp.dot(rows, jnp.ones((x.shape[-1], 1), x.dtype), precision="highest").reshape(
-        *x.shape[:-1], 1
-    )
+    sums = jnp.dot(rows, jnp.ones((x.shape[-1], 1), x.dtype), precision="highest")
+    return sums.reshape(*x.shape[:-1], 1)
 
 
 def _equal_shapes(**arrays: Array) -> None:
     """Raise ValueError for arrays of two shapes, which would be broadcast in silence."""
     if len({x.shape for x in arrays.values()}) > 1:
-        raise ValueError(
-            f"{', '.join(f'{name} {x.shape}' for name, x in arrays.items())} must have one shape"
-        )
+        shapes = [f"{name} {x.shape}" for name, x in arrays.items()]
+        raise ValueError(f"{', '.join(shapes)} must have one shape")
 
 
 def normalise(x: ArrayLike, eps: float = 1e-12) -> Array:
-    """Divide vectors (..., E) by their Euclidean length, or by `eps` if that is larger, as
-    PyTorch's `normalize`.
+    """Divide vectors (..., E) by their Euclidean length, or by `eps` if that is larger.
 
-    A power of two, which changes no digit, brings `x` to order one before it is squared: a length
-    of 1e-7 or 1e20 is right too. The gradient at zero is 1 / eps.
+    PyTorch's `normalize` does the same. The gradient at zero is 1 / eps, so it is finite.
     """
     (x,) = _wide(x)
+    # Squares of 1e-20 or 1e20 leave the range of float32. A power of two, which changes no digit,
+    # brings `x` to order one before it is squared.
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(x), axis=-1, keepdims=True, initial=eps))
     scale = jnp.ldexp(jnp.ones_like(largest), jnp.clip(-jnp.frexp(largest)[1], -126, 126))
     x = x * scale
@@ -75,11 +73,10 @@ def normalise(x: ArrayLike, eps: float = 1e-12) -> Array:
 
 
 def normalise_patches(patches: ArrayLike) -> Array:
-    """Bring each patch (..., C) to zero mean and unit *unbiased* variance (MAE's `norm_pix_loss`,
-    golden Q6).
-    """
+    """Bring each patch (..., C) to zero mean and unit variance (MAE's `norm_pix_loss`)."""
     (patches,) = _wide(patches)
     centred = patches - jnp.mean(patches, axis=-1, keepdims=True)
+    # Divided by C - 1: torch's `var`, which MAE and the release use, is the unbiased one.
     variance = jnp.sum(centred * centred, axis=-1, keepdims=True) / max(patches.shape[-1] - 1, 1)
     return centred * jax.lax.rsqrt(variance + 1e-6)
 
@@ -87,16 +84,22 @@ def normalise_patches(patches: ArrayLike) -> Array:
 def reconstruction_loss(
     pred: ArrayLike, target: ArrayLike, hidden: ArrayLike, *, next_frame: bool
 ) -> tuple[Array, Metrics]:
-    """Return the loss of masked reconstruction and next-frame prediction (Eq. 1, 2), summed as in
-    Eq. 8.
+    """Return the loss of masked reconstruction (Eq. 1) and next frame (Eq. 2), summed as in Eq. 8.
 
-    `pred`, `target` (B, N, T, C); `hidden` (B, N) True on masked positions. With `next_frame` the
-    last of the T frames is the future one: it counts on every position, the others on the hidden
-    positions only. What does not count may be garbage. Returns the sum and {"reconstruction",
-    "next_frame"}. A batch with nothing hidden has a reconstruction loss of 0. Raises ValueError for
-    shapes that do not fit, and for a next frame without another.
+    Args:
+        pred: Predicted patches (B, N, T, C).
+        target: True patches (B, N, T, C).
+        hidden: True (B, N) on masked positions, which alone count. Without any the loss is 0.
+        next_frame: Whether the last of the T frames is the future one, which counts on every
+            position. What does not count may be garbage.
+
+    Returns:
+        The sum, and its terms "reconstruction" and "next_frame".
+
+    Raises:
+        ValueError: For shapes that do not fit, and for a next frame without another.
     """
-    (pred, target) = _wide(pred, target)
+    pred, target = _wide(pred, target)
     hidden = jnp.asarray(hidden, bool)
     _equal_shapes(pred=pred, target=target)
     if pred.ndim != 4 or hidden.shape != pred.shape[:2] or pred.shape[2] <= next_frame:
@@ -105,8 +108,9 @@ def reconstruction_loss(
             f"pred must be {wanted} and hidden (B, N), not {pred.shape} and {hidden.shape}"
         )
     frames = pred.shape[2] - next_frame
-    # (B, N, T)
-    counts = hidden[..., None] | (jnp.arange(pred.shape[2]) >= frames)[None, None]
+    is_future = jnp.arange(pred.shape[2]) >= frames
+    counts = hidden[..., None] | is_future[None, None]  # (B, N, T)
+    # The error is selected, not multiplied by the mask: 0 * NaN would be NaN.
     error = jnp.mean(jnp.where(counts[..., None], pred - target, 0.0) ** 2, axis=-1)
     loss = mean(jnp.mean(error[..., :frames], axis=-1), jnp.sum(hidden))
     metrics = {"reconstruction": loss}
@@ -125,17 +129,22 @@ def info_nce(
     groups: int = 1,
     place: ArrayLike | None = None,
 ) -> Array:
-    """Return InfoNCE from `a` to `b` (B, E) over the rows that are `present` (B,) in both (Eq. 3),
-    a scalar.
+    """Return InfoNCE from `a` to `b` over the rows that have both, a scalar (Eq. 3).
 
-    `scale` is 1 / tau, and counts as 100 beyond 100. A row is present where `present` is not 0.
-    Absent rows are neither anchors nor negatives and may hold garbage; fewer than one pair gives 0.
-    With `groups` > 1 the batch is cut in that many shares, as by the devices of the release.
-    Negatives come from a row's share, and the mean is over all shares. Rows of one `place` i32 (B,)
-    are no negatives of each other. Raises ValueError for shapes that do not fit, and for groups of
-    unequal size.
+    Args:
+        a: Unit-norm embeddings (B, E), the anchors.
+        b: Unit-norm embeddings (B, E), of which a row's own is the positive.
+        scale: 1 / tau, which counts as 100 beyond 100.
+        present: Whether a row (B,) has both. Absent rows are neither anchors nor negatives and may
+            hold garbage; fewer than one pair gives 0.
+        groups: Parts of equal size that the batch is cut into, as by the devices of the release.
+            Negatives come from a row's part, and the mean is over all parts.
+        place: Numbers i32 (B,). Rows of one place are no negatives of each other.
+
+    Raises:
+        ValueError: For shapes that do not fit, and for groups of unequal size.
     """
-    (a, b, scale) = _wide(a, b, scale)
+    a, b, scale = _wide(a, b, scale)
     present = jnp.asarray(present, bool)
     _equal_shapes(a=a, b=b)
     if a.ndim != 2 or present.shape != a.shape[:1]:
@@ -145,21 +154,28 @@ def info_nce(
     rows, width = a.shape
     if groups < 1 or rows % groups:
         raise ValueError(f"{rows} rows cannot be cut into {groups} groups of equal size")
+    # An infinite scale would give 0 * inf below.
     scale = jnp.minimum(scale, jnp.finfo(scale.dtype).max)
-    # it can fall again
+    # Clipped by a factor without gradient: a scale beyond the limit keeps its own, so that it can
+    # fall again.
     scale = scale * jax.lax.stop_gradient(jnp.where(scale > MOST_SCALE, MOST_SCALE / scale, 1.0))
     present = present.reshape(groups, rows // groups)
-    a, b = (jnp.where(present[..., None], x.reshape(*present.shape, width), 0.0) for x in (a, b))
+    # Garbage in absent rows must not reach the products: a NaN there would reach every gradient.
+    a = jnp.where(present[..., None], a.reshape(*present.shape, width), 0.0)
+    b = jnp.where(present[..., None], b.reshape(*present.shape, width), 0.0)
     # The factor is up to 100: the reduced precision that accelerators use by default would show in
     # the loss.
     logits = scale * jnp.einsum("gie,gje->gij", a, b, precision=jax.lax.Precision.HIGHEST)
-    rivals = present[:, None, :]
+    # Which columns a row is compared with (groups, rows, columns): the negatives, and its own.
+    negatives_mask = present[:, None, :]
     if place is not None:
         place = jnp.asarray(place).reshape(present.shape)
-        rivals = rivals & (
-            (place[:, :, None] != place[:, None, :]) | jnp.eye(place.shape[1], dtype=bool)[None]
-        )
-    logits = jnp.where(rivals, logits, jnp.finfo(logits.dtype).min)
+        elsewhere = place[:, :, None] != place[:, None, :]
+        itself = jnp.eye(place.shape[1], dtype=bool)[None]
+        negatives_mask = negatives_mask & (elsewhere | itself)
+    # The lowest finite number, not -inf: the logsumexp of a row without anything would be
+    # inf - inf, and its gradient NaN although the row does not count.
+    logits = jnp.where(negatives_mask, logits, jnp.finfo(logits.dtype).min)
     own = jnp.diagonal(logits, axis1=1, axis2=2)
     loss = jnp.where(present, jax.nn.logsumexp(logits, axis=-1) - own, 0.0)
     pairs = jnp.sum(present, axis=1).astype(loss.dtype)
@@ -167,11 +183,10 @@ def info_nce(
 
 
 def centered(x: ArrayLike, present: ArrayLike) -> Array:
-    """Return unit vectors (B, E): `x` minus its mean over the rows that are `present` (B,) bool;
-    others are 0.
+    """Return unit vectors (B, E): `x` minus its mean over the `present` rows; others are 0.
 
-    Not in the paper. A vector within 0.001 of the mean stays shorter than 1: such a spread is
-    rounding.
+    Not in the paper. A vector within 0.001 of the mean stays shorter than 1, because such a spread
+    is rounding.
     """
     (x,) = _wide(x)
     present = jnp.asarray(present, bool)[:, None]
@@ -180,7 +195,7 @@ def centered(x: ArrayLike, present: ArrayLike) -> Array:
     return normalise(jnp.where(present, x - mean, 0.0), eps=1e-3)
 
 
-def alignment_loss(
+def alignment_loss(  # noqa: PLR0913  Eq. 4 has three modalities, two of which may be missing
     touch: ArrayLike,
     image: ArrayLike | None,
     text: ArrayLike | None,
@@ -192,24 +207,34 @@ def alignment_loss(
     groups: int = 1,
     center: bool = False,
 ) -> tuple[Array, Metrics]:
-    """Return the loss of joint alignment of touch, vision and text with missing modalities (Eq. 4).
+    """Return the loss of joint alignment of touch, vision and text (Eq. 4).
 
-    `touch`, `image`, `text` (B, E) of unit length; `has_image`, `has_text` (B,) bool; `weights` are
-    the factors of the pairs (touch-vision, touch-text, vision-text) on the sum of both directions.
-    A modality that is None is absent from the whole batch. `center` subtracts each modality's batch
-    mean first. Untrained towers share one large direction, and without this the loss falls by
-    growing it until all embeddings are equal. Returns the loss, its six terms and the number of
-    pairs of each kind. Raises ValueError for shapes that do not fit.
+    Args:
+        touch: Unit-norm embeddings (B, E).
+        image: Unit-norm embeddings (B, E), or None if the whole batch lacks them.
+        text: Unit-norm embeddings (B, E), or None.
+        has_image: Which rows (B,) have an image. None: all.
+        has_text: Which rows (B,) have a text. None: all.
+        scale: 1 / tau.
+        weights: Factors of touch-vision, touch-text and vision-text on the sum of both directions.
+        groups: See `info_nce`.
+        center: Subtract each modality's batch mean first. Untrained towers share one large
+            direction, and without this the loss falls by growing it until all embeddings are equal.
+
+    Returns:
+        The loss, its six terms, and the number of pairs of each kind.
+
+    Raises:
+        ValueError: For shapes that do not fit.
     """
     everyone = jnp.ones(len(jnp.asarray(touch)), bool)
     given = {"touch": (touch, None), "vision": (image, has_image), "text": (text, has_text)}
-    z = {
-        name: (jnp.asarray(x), everyone if has is None else jnp.asarray(has, bool))
-        for name, (x, has) in given.items()
-        if x is not None
-    }
-    if center:
-        z = {name: (centered(x, has), has) for name, (x, has) in z.items()}
+    z: dict[str, tuple[Array, Array]] = {}
+    for name, (x, has) in given.items():
+        if x is None:
+            continue
+        has = everyone if has is None else jnp.asarray(has, bool)
+        z[name] = (centered(x, has) if center else jnp.asarray(x), has)
     if len(weights) != 3:
         raise ValueError(
             "weights are three factors, of touch-vision, touch-text and vision-text, not "
@@ -222,8 +247,8 @@ def alignment_loss(
     for (first, second), weight in zip(pairs, weights, strict=True):
         if first not in z or second not in z:
             continue
-        (a, has_a) = z[first]
-        (b, has_b) = z[second]
+        a, has_a = z[first]
+        b, has_b = z[second]
         both = has_a & has_b
         forth = info_nce(a, b, scale, both, groups=groups)
         back = info_nce(b, a, scale, both, groups=groups)
@@ -244,12 +269,23 @@ def contrast_loss(
     groups: int = 1,
     place: ArrayLike | None = None,
 ) -> tuple[Array, Array]:
-    """InfoNCE matching between the two unit-norm touches (B, E) of each pair. Not in the paper.
+    """Return InfoNCE between the two touches of each pair. Not in the paper.
 
-    All other places of the batch are negatives, up to 2 B - 2 for each pair instead of one. `place`
-    i32 (B,) is equal for pairs of one place; None means that no two are. Returns the mean of both
-    directions, and the share of `first` whose nearest `second` is of its place. Raises ValueError
-    as `info_nce`.
+    All other places of the batch are negatives, up to 2 B - 2 for each pair instead of one.
+
+    Args:
+        first: Unit-norm embeddings (B, E).
+        second: Unit-norm embeddings (B, E) of touches of the same places.
+        scale: 1 / tau.
+        groups: See `info_nce`.
+        place: Numbers i32 (B,), equal for pairs of one place. None: no two are.
+
+    Returns:
+        The mean of both directions, and the ratio of `first` whose nearest `second` is of its
+        place.
+
+    Raises:
+        ValueError: As `info_nce`.
     """
     first, second, scale = _wide(first, second, scale)
     everyone = jnp.ones(len(first), bool)
@@ -262,20 +298,20 @@ def contrast_loss(
 
 
 def matching_loss(positive_logit: ArrayLike, negative_logit: ArrayLike) -> Array:
-    """Return the binary cross-entropy of matching from logits (B,), each kind averaged over the
-    batch (Eq. 6).
+    """Return the binary cross-entropy of matching from logits (B,) (Eq. 6).
 
-    Without pairs it is 0.
+    Each kind is averaged over the batch. Without pairs it is 0.
     """
     positive, negative = _wide(positive_logit, negative_logit)
+    # -log sigmoid(x) is softplus(-x), which stays finite for logits of +-1e4
     return mean(jax.nn.softplus(-positive)) + mean(jax.nn.softplus(negative))
 
 
 def laplace_loss(error: ArrayLike, log_scale: ArrayLike) -> Array:
-    """Return the negative log likelihood of errors under Laplace deviations exp(`log_scale`),
-    element-wise.
+    """Return the negative log likelihood of errors under Laplace distributions, element-wise.
 
-    The logarithm is bent smoothly into -5..5, so that no deviation vanishes or explodes.
+    Their scales are exp(`log_scale`). The logarithm is bent smoothly into -5..5, so that no
+    deviation vanishes or explodes.
     """
     error, log_scale = _wide(error, log_scale)
     log_scale = 5.0 * jnp.tanh(log_scale / 5.0)

@@ -1,8 +1,8 @@
-"""Images and clips as token sequences: patches, position tables, segments, sensor tokens (Sec. 3.1,
-3.5), masking.
+"""Token sequences of images and clips: patches, positions, segments, sensor tokens, masks.
 
-B batch, T frames, H W pixels, C colours, P patch, N = (H/P)(W/P) positions, K kept ones, D width.
-Masking is random (Sec. 3.2; He et al., 2022). Arrays may be numpy's, lists or numbers.
+The paper describes them in Sec. 3.1 and 3.5. Masking is random (Sec. 3.2; He et al., 2022). B
+batch, T frames, H W pixels, C colours, P patch, N = (H/P)(W/P) positions, K kept ones, D width.
+Arrays may be numpy's, lists or numbers.
 """
 
 from __future__ import annotations
@@ -13,12 +13,13 @@ from jax.typing import ArrayLike
 
 
 def patchify(clip: ArrayLike, patch: int) -> Array:
-    """Cut `clip` (B, T, H, W, C) into patch vectors (B, N, T, P*P*C), each in the order (row, col,
-    colour).
+    """Cut `clip` (B, T, H, W, C) into patch vectors (B, N, T, P*P*C).
 
-    Raises ValueError for another shape, and when H or W is no multiple of `patch`.
+    Each is in the order (row, column, colour). Raises ValueError for another shape, and when H or W
+    is no multiple of `patch`.
     """
-    b, t, h, w, c = _shape(clip := jnp.asarray(clip), "a clip", "B T H W C")
+    clip = jnp.asarray(clip)
+    b, t, h, w, c = _shape(clip, "a clip", "B T H W C")
     if patch < 1 or h % patch or w % patch:
         raise ValueError(f"a {h} x {w} image cannot be cut into patches of {patch} pixels")
     rows = h // patch
@@ -28,12 +29,16 @@ def patchify(clip: ArrayLike, patch: int) -> Array:
 
 
 def unpatchify(patches: ArrayLike, patch: int, height: int) -> Array:
-    """The exact inverse of `patchify`: (B, N, T, P*P*C) -> (B, T, H, W, C) with H = `height`.
+    """Return the exact inverse of `patchify`: (B, N, T, P*P*C) -> (B, T, H, W, C).
 
-    Raises ValueError for another shape, and for patches that do not make images of `height`.
+    H is `height`. Raises ValueError for another shape, and for patches that do not make images of
+    that height.
     """
-    b, n, t, size = _shape(patches := jnp.asarray(patches), "patches", "B N T P*P*C")
-    rows = 0 if patch < 1 or height % patch else height // patch
+    patches = jnp.asarray(patches)
+    b, n, t, size = _shape(patches, "patches", "B N T P*P*C")
+    rows = 0
+    if patch > 0 and height % patch == 0:
+        rows = height // patch
     if rows < 1 or n % rows or size % patch**2:
         raise ValueError(
             f"{n} patches of {size} values and {patch} pixels do not make images of height {height}"
@@ -52,11 +57,11 @@ def _shape(x: Array, name: str, axes: str) -> tuple[int, ...]:
 
 
 def sincos_table(width: int, grid: int) -> Array:
-    """Fixed 2-D sine-cosine positions (1 + grid^2, width); row 0, the class token's, is zero (MAE,
-    golden I).
+    """Return fixed 2-D sine-cosine positions (1 + grid^2, width), as MAE.
 
-    The first half of the channels encodes the column, the second the row, each as [sin | cos].
-    Raises ValueError when `width` is no multiple of 4, or `grid` is negative.
+    Row 0, the class token's, is zero. The first half of the channels encodes the column, the second
+    the row, each as [sin | cos]. MAE's code has it in this order, although its names say the
+    opposite. Raises ValueError when `width` is no multiple of 4, or `grid` is negative.
     """
     if width < 4 or width % 4 or grid < 0:
         raise ValueError(
@@ -74,14 +79,14 @@ def sincos_table(width: int, grid: int) -> Array:
 
 
 def segments(clip: ArrayLike, frames: int) -> Array:
-    """Cut a long clip (B, T, ...) into S = ceil(T / frames) segments (B, S, frames, ...) (App.
+    """Cut a long clip (B, T, ...) into S = ceil(T / frames) segments (B, S, frames, ...).
 
-    "frame number").
-
-    The last segment ends with the last frame, so it overlaps its neighbour when T is no multiple of
-    `frames`. Raises ValueError when T is smaller than `frames`, or `frames` below 1.
+    See the paper's appendix, "Discussion on frame number". The last segment ends with the last
+    frame, so it overlaps its neighbour when T is no multiple of `frames`. Raises ValueError when T
+    is smaller than `frames`, or `frames` below 1.
     """
-    total = (clip := jnp.asarray(clip)).shape[1]
+    clip = jnp.asarray(clip)
+    total = clip.shape[1]
     if frames < 1:
         raise ValueError(f"a segment has 1 frame or more, not {frames}")
     if total < frames:
@@ -94,10 +99,9 @@ def segments(clip: ArrayLike, frames: int) -> Array:
 
 
 def universal_probability(progress: ArrayLike, start: float, end: float) -> Array:
-    """Return p_u, which grows linearly from `start` to `end` with `progress` in [0, 1] (appendix: 0
-    to 0.75).
+    """Return p_u, which grows linearly from `start` to `end` with `progress` in [0, 1].
 
-    Before 0 and after 1 it stays where it is.
+    The paper's appendix has 0 to 0.75. Before 0 and after 1 it stays where it is.
     """
     return start + (end - start) * jnp.clip(jnp.asarray(progress, float), 0, 1)
 
@@ -105,8 +109,7 @@ def universal_probability(progress: ArrayLike, start: float, end: float) -> Arra
 def draw_tokens(
     sensor: ArrayLike, uniform: ArrayLike, probability: ArrayLike, universal_row: int
 ) -> Array:
-    """Replace a sensor's row by the universal one where `uniform` < p_u: i ~ Bernoulli(p_u) (Eq.
-    7).
+    """Replace a sensor's row by the universal one where `uniform` < p_u (Eq. 7).
 
     `sensor` i32 (B,), `uniform` (B,) in [0, 1). Returns rows i32 (B,) of the sensor-token table.
     """
@@ -115,14 +118,14 @@ def draw_tokens(
 
 
 def count_visible(positions: int, ratio: float) -> int:
-    """Return how many of `positions` stay visible: floor(N * ratio) in floating point, as the
-    release.
+    """Return how many of `positions` stay visible: floor(N * ratio).
 
-    Raises ValueError for a negative number, and for a ratio outside 0 to 1.
+    It is computed in floating point, as in the release. Raises ValueError for a negative number,
+    and for a ratio outside 0 to 1.
     """
     if positions < 0 or not 0 <= ratio <= 1:
         raise ValueError(
-            f"a share between 0 and 1 of 0 or more positions stays visible, not {ratio} of "
+            f"a ratio between 0 and 1 of 0 or more positions stays visible, not {ratio} of "
             f"{positions}"
         )
     return int(positions * ratio)
@@ -136,18 +139,19 @@ def random_mask(noise: ArrayLike, keep: int) -> tuple[Array, Array, Array]:
     removed (Omega_M of Eq. 1). Raises ValueError for a number of positions to keep that is not 0 to
     N.
     """
-    _, count = _shape(noise := jnp.asarray(noise), "noise", "B N")
+    noise = jnp.asarray(noise)
+    _, count = _shape(noise, "noise", "B N")
     if not 0 <= keep <= count:
         raise ValueError(f"0 to {count} of {count} positions can be kept, not {keep}")
+    # Each row is sorted by itself. One permutation for the whole batch would look right, and train
+    # on the same positions of every sample. The inverse of a permutation is its argsort.
     order = jnp.argsort(noise, axis=1)
     restore_ids = jnp.argsort(order, axis=1)
     return order[:, :keep], restore_ids, restore_ids >= keep
 
 
 def keep(x: ArrayLike, keep_ids: ArrayLike) -> Array:
-    """Return the positions `keep_ids` i32 (B, K) of `x` (B, N, ...), as (B, K, ...) (He et al.,
-    2022).
-    """
+    """Return the positions `keep_ids` i32 (B, K) of `x` (B, N, ...), as (B, K, ...)."""
     x = jnp.asarray(x)
     keep_ids = jnp.asarray(keep_ids)
     ids = keep_ids.reshape(keep_ids.shape + (1,) * (x.ndim - 2))
@@ -155,16 +159,17 @@ def keep(x: ArrayLike, keep_ids: ArrayLike) -> Array:
 
 
 def restore(visible: ArrayLike, mask_token: ArrayLike, restore_ids: ArrayLike) -> Array:
-    """Put `visible` (B, K, D) back to its positions and the mask token (D,) everywhere else: (B, N,
-    D).
+    """Return (B, N, D): `visible` (B, K, D) at its positions, the mask token (D,) at all others.
 
     Raises ValueError for more visible positions than there are.
     """
-    batch, count, width = _shape(visible := jnp.asarray(visible), "visible", "B K D")
-    missing = (restore_ids := jnp.asarray(restore_ids)).shape[1] - count
+    visible = jnp.asarray(visible)
+    restore_ids = jnp.asarray(restore_ids)
+    batch, count, width = _shape(visible, "visible", "B K D")
+    missing = restore_ids.shape[1] - count
     if missing < 0:
         raise ValueError(f"{count} visible positions do not fit into {restore_ids.shape[1]}")
     hidden = jnp.broadcast_to(jnp.asarray(mask_token, visible.dtype), (batch, missing, width))
-    return jnp.take_along_axis(
-        jnp.concatenate([visible, hidden], axis=1), restore_ids[..., None], axis=1
-    )
+    # [visible, hidden] is in the order of the noise; `restore_ids` brings it to that of the grid.
+    ordered = jnp.concatenate([visible, hidden], axis=1)
+    return jnp.take_along_axis(ordered, restore_ids[..., None], axis=1)

@@ -118,6 +118,11 @@ class SimulatedLoader:
             partial(_assemble, config=config, rows=self._rows, devices=devices)
         )
 
+    @staticmethod
+    def train_tokenizer(config: Config, manifest: Manifest | None) -> Tokenizer:
+        """Return `caption_tokenizer`."""
+        return caption_tokenizer(config, manifest)
+
     @property
     def steps_per_epoch(self) -> int:
         """Steps of a warm-up: simulated touches have no epoch."""

@@ -1,4 +1,4 @@
-"""The training loop: compile, feed, log, save, continue.
+"""Training loop: compile, feed, log, save, continue.
 
 Its side effects are here and in `progress.py`.
 """
@@ -23,14 +23,24 @@ from anytouch_jax.errors import UserError, refuse_forked
 from anytouch_jax.shown import shown_short
 from anytouch_jax.train import mesh as meshes
 from anytouch_jax.train import progress
-from anytouch_jax.train.optim import optimizer
-from anytouch_jax.train.progress import Log, Record, silent, to_stderr, writing
-from anytouch_jax.train.step import LossFn, TrainedFn, TrainState, init_state, make_step, merge
+from anytouch_jax.train.optim import RateFn, optimizer
+from anytouch_jax.train.pace import Deadline, Pace, StepPace
+from anytouch_jax.train.progress import Display, Log, Record, silent, to_stderr, writing
+from anytouch_jax.train.step import (
+    LossFn,
+    Rules,
+    StepFn,
+    TrainedFn,
+    TrainState,
+    init_state,
+    make_step,
+    merge,
+)
 from anytouch_jax.weights.checkpoint import PARTIAL, Checkpoints
 
 Tree = Any
 Example = tuple[Any, Callable[[], Any]]  # the shapes of a batch, and a function that makes it
-# the metrics of a step that its ballot adds
+# Metrics of a step that its all-reduce of flags adds.
 _SIGNAL = "signal"
 _SKIPPED = "skipped_samples"
 # batches(start, stop) -> (step, batch, numbers of the loader for the log) for each step of the
@@ -43,9 +53,7 @@ Report = Callable[[int, Tree, Any], None]
 @shown_short
 @dataclass(frozen=True)
 class FitResult:
-    """The result of a run or a part of one: the state after `step` steps and the last line of
-    metrics.
-    """
+    """Result of a run or a part of one: the state after `step` steps, and the last metrics."""
 
     state: TrainState
     step: int
@@ -53,6 +61,7 @@ class FitResult:
     traces: int = 0  # how often the step was traced: once a batch structure
     resumed: int = 0  # the step that the run continued from
     interrupted: signal.Signals | None = None  # the signal that ended it early
+    losses: tuple[float, ...] = ()  # of every step of the run, NaN where it was not finite
 
     @property
     def params(self) -> Tree:
@@ -60,7 +69,46 @@ class FitResult:
         return merge(self.state.trainable, self.state.frozen)
 
 
-def fit(
+@dataclass(frozen=True)
+class Work:
+    """What a run trains, and from what.
+
+    `params` are the first parameters; when a run continues, only their shapes matter. `loss_fn` and
+    `trained` are those of `make_step`. `examples` are a batch of each structure, its shapes and a
+    function that makes it, whose steps are compiled side by side. `metadata` goes into every
+    checkpoint.
+    """
+
+    params: Tree
+    loss_fn: LossFn
+    batches: Batches
+    trained: TrainedFn | None = None
+    frozen: Rules | None = None  # (regex over parameter names, frozen?). None: `config.frozen`
+    rates: RateFn | None = None  # factors on learning rates. None: those of `config.optim`
+    examples: Sequence[Example] = ()
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """How a run goes: when it ends, on which devices, and what it reports.
+
+    `stop_after` ends it after that many steps in all, without changing the schedule, and `pace` by
+    time. `on_report(step, params, batch)` draws figures and must not keep the arrays. `display`
+    gives a function for each line of metrics; None shows a bar on a terminal, with a `curve` of the
+    loss, or writes lines to `log`.
+    """
+
+    stop_after: int | None = None
+    pace: Pace | None = None
+    on_report: Report | None = None
+    log: Log | None = None
+    mesh: Mesh | None = None
+    curve: bool = False
+    display: Display | None = None
+
+
+def fit(  # noqa: PLR0913  a keyword for each field of both records, as before there were records
     config: Config,
     *,
     params: Tree,
@@ -77,54 +125,100 @@ def fit(
     until: float | None = None,
     examples: Sequence[Example] = (),
 ) -> FitResult:
-    """Train `config.run.steps` steps in a run folder, or continue from its latest complete
-    checkpoint.
+    """Train `config.run.steps` steps in a run folder, or continue from its latest checkpoint.
 
-    `params` are the first parameters; when a run continues, only their shapes matter. `loss_fn` and
-    `trained` are those of `make_step`. `stop_after` ends the run after that many steps in all,
-    without changing the schedule. `on_report(step, params, batch)` draws figures and must not keep
-    the arrays. `curve` shows the loss on a terminal. `until` ends the run at that time of
-    `time.monotonic`, which the schedule then follows. `examples` are a batch of each structure, its
-    shapes and a function that makes it, whose steps are compiled side by side. SIGTERM and Ctrl-C,
-    in one of several processes, finish the step, save and return. Raises UserError for settings
-    that changed since the start, too many skipped steps in a row, a full disk, an unreadable
-    checkpoint, and a folder that some process cannot see.
+    See `fit_work`, whose records have these fields. `until` ends the run at that time of
+    `time.monotonic`, which the schedule then follows.
+    """
+    work = Work(params, loss_fn, batches, trained, examples=examples, metadata=metadata or {})
+    pace = None if until is None else Deadline(until)
+    options = FitOptions(stop_after, pace, on_report, log, mesh, curve)
+    return fit_work(config, work, run_dir, options)
+
+
+def fit_work(
+    config: Config, work: Work, run_dir: Path | str | None, options: FitOptions | None = None
+) -> FitResult:
+    """Train `config.run.steps` steps in a run folder, or continue from its latest checkpoint.
+
+    SIGTERM and Ctrl-C, in one of several processes, finish the step, save and return.
+
+    Args:
+        config: Its `optim` and `run` decide the optimiser, the schedule and what is saved.
+        work: What is trained.
+        run_dir: The run folder, made if it is missing. None keeps nothing, for work of a minute.
+        options: How it goes.
+
+    Raises:
+        UserError: For settings that changed since the start, too many skipped steps in a row, a
+            full disk, an unreadable checkpoint, and a folder that some process cannot see.
     """
     refuse_forked()
-    run_dir = Path(run_dir)
-    mesh = mesh or meshes.make_mesh(fsdp=config.run.fsdp)
-    log = log or to_stderr
+    options = options or FitOptions()
+    mesh = options.mesh or meshes.make_mesh(fsdp=config.run.fsdp)
+    log = options.log or to_stderr
     lead = jax.process_index() == 0
-    stop = min(config.run.steps, config.run.steps if stop_after is None else stop_after)
+    if not lead:
+        log = silent
+    pace = options.pace or StepPace()
+    stop = config.run.steps
+    if options.stop_after is not None:
+        stop = min(stop, options.stop_after)
     with contextlib.ExitStack() as stack:
-        if lead:
-            stack.enter_context(progress.alone_in(run_dir))
-            progress.open_run(run_dir, config)
-        else:
-            # each process reports a changed setting
-            progress.continues(run_dir, config)
-            log = silent
-        meshes.check_shared(run_dir / "figures")
-        with writing(folder := run_dir / "checkpoints"):
-            text = to_json(config)
-            about = dict(metadata or {})
-            checkpoints = Checkpoints(
-                folder, keep=config.run.keep, config_json=text, metadata=about
-            )
-        stack.push(checkpoints.leave)
-        state, start = _first_state(config, params, checkpoints, mesh)
-        if start:
-            log(f"continuing from the checkpoint of step {start}")
-        if start >= stop:
-            log(f"nothing to do: {start} of {config.run.steps} steps are done")
-            return FitResult(state, start, resumed=start)
-        checkpoints.check_space(state)
+        checkpoints = None
+        if run_dir is not None:
+            run_dir = Path(run_dir)
+            checkpoints = _open(run_dir, config, work.metadata, stack)
+        state, start = _first_state(config, work, checkpoints, mesh)
         record = Record(run_dir, start, tensorboard=config.run.tensorboard, lead=lead)
         stack.enter_context(contextlib.closing(record))
-        advance = stack.enter_context(progress.progress(start, stop, log, curve=curve))
-        loop = _Loop(config, mesh, checkpoints, record, log, advance, on_report, until)
-        interrupt = stack.enter_context(progress.signals())
-        return loop.run(state, start, stop, batches, loss_fn, trained, interrupt, examples)
+        pace.resume(record.last)
+        stop = min(stop, pace.total or stop)
+        if start:
+            of_total = f" of {pace.total}" if pace.total else ""
+            log(f"continuing from the checkpoint of step {start}{of_total}")
+        if start >= stop:
+            log(f"nothing to do: {start} of {pace.total or config.run.steps} steps are done")
+            return FitResult(state, start, resumed=start, losses=tuple(record.losses))
+        if checkpoints is not None:
+            checkpoints.check_space(state)
+        display = options.display
+        if display is None:
+            display = functools.partial(progress.progress, log=log, curve=options.curve)
+        advance = stack.enter_context(display(start, stop))
+        loop = _Loop(config, work, mesh, checkpoints, record, log, advance, options.on_report, pace)
+        interrupt: list[signal.Signals] = []
+        if checkpoints is not None:
+            # Where nothing is kept, a signal ends the work at once.
+            interrupt = stack.enter_context(progress.signals())
+        result = loop.run(state, start, stop, interrupt)
+    if result.interrupted and run_dir is not None:
+        # After the bar has gone, which would draw over the line.
+        log(
+            f"stopped by {result.interrupted.name} after step {result.step} and saved in "
+            f"{run_dir}, the same command continues from here"
+        )
+    return result
+
+
+def _open(
+    run_dir: Path, config: Config, metadata: Mapping[str, Any], stack: contextlib.ExitStack
+) -> Checkpoints:
+    """Make, lock and check a run folder until `stack` ends, and return its checkpoints."""
+    if jax.process_index() == 0:
+        stack.enter_context(progress.alone_in(run_dir))
+        progress.open_run(run_dir, config)
+    else:
+        # each process reports a changed setting
+        progress.continues(run_dir, config)
+    meshes.check_shared(run_dir / "figures")
+    folder = run_dir / "checkpoints"
+    with writing(folder):
+        checkpoints = Checkpoints(
+            folder, keep=config.run.keep, config_json=to_json(config), metadata=dict(metadata)
+        )
+    stack.push(checkpoints.leave)
+    return checkpoints
 
 
 @dataclass
@@ -132,14 +226,15 @@ class _Loop:
     """The loop, and its state between steps."""
 
     config: Config
+    work: Work
     mesh: Mesh
-    checkpoints: Checkpoints
+    checkpoints: Checkpoints | None
     record: Record
     log: Log
     advance: Callable[[Mapping[str, Any]], None]
     on_report: Report | None
-    until: float | None = None
-    begun: float | None = None  # when the first step had ended, in a run for a time
+    pace: Pace
+    # the step before, whose metrics are read while the next one runs
     pending: tuple[int, dict[str, jax.Array], dict[str, Any]] | None = None
     row: dict[str, Any] = field(default_factory=dict)
     # since the last checkpoint: their mean decides which is the best
@@ -155,123 +250,114 @@ class _Loop:
         self.last = LastStep()
 
     def run(
-        self,
-        state: TrainState,
-        start: int,
-        stop: int,
-        batches: Batches,
-        loss_fn: LossFn,
-        trained: TrainedFn | None,
-        interrupt: list[signal.Signals],
-        examples: Sequence[Example] = (),
+        self, state: TrainState, start: int, stop: int, interrupt: list[signal.Signals]
     ) -> FitResult:
-        """Run steps `start` to `stop`, or until a signal arrives."""
+        """Run steps `start` to `stop`, or until a signal arrives or the pace ends it."""
         every = self.config.run.save_every
         figures = self.config.run.figure_every
-        step_fn = self.compile(state, loss_fn, trained)
         sharding = meshes.batch_sharding(self.mesh)
         # Under jit, for the devices of other processes too; and without a transfer of the seed.
         seed_key = jax.jit(
             lambda: jax.random.key(self.config.run.seed), out_shardings=meshes.replicated(self.mesh)
         )()
-        step_fn = self.ahead(step_fn, state, seed_key, examples)
+        step_fn = self.ahead(self.compile(state), state, seed_key)
         done = start
         saved = start
         reported = start
         placed = None
-        with contextlib.closing(self.awaited(batches, start, stop)) as feed:
+        with contextlib.closing(self.awaited(start, stop)) as feed:
             for step, batch, info in feed:
                 placed = meshes.put_batch(batch, sharding)
-                state, metrics = step_fn(state, placed, seed_key, *self.progress())
+                state, metrics = step_fn(state, placed, seed_key, *self.progress(step))
                 if self.ballot:
-                    votes = self.ballot.cast(
-                        int(interrupt[0]) if interrupt else 0, int(info.get(_SKIPPED, 0))
-                    )
-                    metrics = metrics | dict(zip((_SIGNAL, _SKIPPED), votes, strict=True))
-                self.log_metrics()  # of the step before, while this one runs
+                    received = int(interrupt[0]) if interrupt else 0
+                    flags = self.ballot.cast(received, int(info.get(_SKIPPED, 0)))
+                    metrics = metrics | dict(zip((_SIGNAL, _SKIPPED), flags, strict=True))
+                # Those of the step before, while this one runs: reading them waits for the device,
+                # which would then have nothing to do until the next batch is there.
+                self.log_metrics()
                 self.last.began(metrics)
-                samples = jax.tree.leaves(batch)[0].shape[0] * jax.process_count()
-                self.pending = (step, metrics, {"samples": samples} | dict(info))
                 done = step + 1
-                if self.until is not None and self.begun is None:  # compiled
-                    jax.block_until_ready(metrics)
-                    self.begun = time.monotonic()
+                is_over = self.pace.stepped(done, metrics)
+                samples = jax.tree.leaves(batch)[0].shape[0] * jax.process_count()
+                numbers = {"samples": samples} | dict(info) | self.pace.numbers()
+                self.pending = (step, metrics, numbers)
                 if every > 0 and done % every == 0:
                     saved = self.save(done, state, done - saved)
                 if figures > 0 and done % figures == 0:
                     reported = self.report(done, state, placed)
-                if self.shared_signal if self.ballot else interrupt:
-                    break
-                if self.until is not None and time.monotonic() >= self.until:
+                if is_over or self.signalled(interrupt):
                     break
         if saved < done:
             self.save(done, state, done - saved)
-        self.checkpoints.wait()
-        signalled = self.shared_signal if self.ballot else next(iter(interrupt), None)
+        if self.checkpoints is not None:
+            self.checkpoints.wait()
+        signalled = self.signalled(interrupt)
         if figures > 0 and reported < done and not signalled:
             self.report(done, state, placed)
-        if signalled:
-            self.log(
-                f"stopped by {signalled.name} after step {done} and saved, the same command "
-                "continues from here"
-            )
-        return FitResult(state, done, self.row, self.traces, start, signalled)
+        losses = tuple(self.record.losses)
+        return FitResult(state, done, self.row, self.traces, start, signalled, losses)
 
-    def ahead(
-        self, step_fn: Any, state: TrainState, key: jax.Array, examples: Sequence[Example]
-    ) -> Callable[..., Any]:
+    def signalled(self, interrupt: list[signal.Signals]) -> signal.Signals | None:
+        """Return the signal that ends the run, the same in each of several processes."""
+        if self.ballot:
+            return self.shared_signal
+        return next(iter(interrupt), None)
+
+    def ahead(self, step_fn: Any, state: TrainState, key: jax.Array) -> Callable[..., Any]:
         """Return the step, compiled for the batch of each example side by side.
 
         Others compile when they come.
         """
+        examples = self.work.examples
 
         def form(batch: Any) -> Any:
-            return jax.tree.structure(batch), tuple(
-                (x.shape, x.dtype) for x in jax.tree.leaves(batch)
-            )
+            shapes = tuple((x.shape, x.dtype) for x in jax.tree.leaves(batch))
+            return jax.tree.structure(batch), shapes
 
         sharding = meshes.batch_sharding(self.mesh)
 
         def build(shapes: Any) -> tuple[Any, Any]:
-            batch = jax.tree.map(
-                lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding), shapes
-            )
-            return form(batch), step_fn.lower(state, batch, key, *self.progress()).compile()
+            def placed(x: Any) -> jax.ShapeDtypeStruct:
+                return jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding)
+
+            batch = jax.tree.map(placed, shapes)
+            return form(batch), step_fn.lower(state, batch, key, *self.progress(0)).compile()
 
         if len(examples) < 2:
             return step_fn
+        # XLA compiles outside of Python's lock, so that two steps and the programs that make their
+        # batches take as long as the slowest.
         with ThreadPoolExecutor(2 * len(examples)) as pool:
             made = [pool.submit(make) for _, make in examples]
             programs = dict(pool.map(build, [shapes for shapes, _ in examples]))
             for one in made:
                 one.result()
-        return lambda state, batch, *rest: programs.get(form(batch), step_fn)(state, batch, *rest)
 
-    def progress(self) -> tuple[np.float32, ...]:
-        """Return the share of the time that has passed, nothing in a run of a given number of
-        steps.
-        """
-        if self.until is None:
-            return ()
-        if self.begun is None:
-            return (np.float32(0),)
-        return (
-            np.float32(
-                min((time.monotonic() - self.begun) / max(self.until - self.begun, 1e-3), 1.0)
-            ),
-        )
+        def compiled(state: TrainState, batch: Any, *rest: Any) -> Any:
+            return programs.get(form(batch), step_fn)(state, batch, *rest)
 
-    def awaited(self, batches: Batches, start: int, stop: int) -> Generator[Item, None, None]:
-        """Yield the batches of steps `start` to `stop` in order, count the time without one, and
-        close their source.
+        return compiled
+
+    def progress(self, step: int) -> tuple[np.float32, ...]:
+        """Return the last arguments of a step: its progress, or nothing where it knows its own."""
+        ratio = self.pace.progress(step)
+        return () if ratio is None else (ratio,)
+
+    def awaited(self, start: int, stop: int) -> Generator[Item, None, None]:
+        """Yield the batches of steps `start` to `stop`, and count the time that lacked one.
+
+        Raises UserError if they end early. Closes their source.
         """
-        source = batches(start, stop)
+        source = self.work.batches(start, stop)
         expected = start
         requested = time.perf_counter()
         try:
             for step, batch, info in source:
                 if step != expected:
                     raise ValueError(f"the batches gave step {step} instead of step {expected}")
+                # The device waits from the end of the step before. While that step runs, a late
+                # batch costs nothing.
                 ended = self.last.ended() if self.pending else requested
                 if ended is not None:
                     self.waited += time.perf_counter() - max(requested, ended)
@@ -284,23 +370,22 @@ class _Loop:
                 f"the data ended after {expected} of {stop} steps. Pass batches for every step."
             )
         finally:
-            getattr(source, "close", lambda: None)()
+            # A loader's threads stop. A plain iterator has nothing to close.
+            close = getattr(source, "close", None)
+            if close is not None:
+                close()
 
-    def compile(
-        self, state: TrainState, loss_fn: LossFn, trained: TrainedFn | None
-    ) -> Callable[..., tuple[TrainState, dict[str, jax.Array]]]:
-        """Return the jitted step, which keeps the sharding of the state and is traced once a batch
-        structure.
+    def compile(self, state: TrainState) -> StepFn:
+        """Return the jitted step, traced once a batch structure.
+
+        It keeps the sharding of the state.
         """
-        loss_fn = meshes.gathering(loss_fn, self.mesh)
-        tx = optimizer(self.config)
-        options = self.config.optim
         step = make_step(
-            loss_fn,
-            tx,
+            meshes.gathering(self.work.loss_fn, self.mesh),
+            optimizer(self.config, self.work.rates),
             total_steps=self.config.run.steps,
-            accumulate=options.accumulate,
-            trained=trained,
+            accumulate=self.config.optim.accumulate,
+            trained=self.work.trained,
         )
 
         @functools.wraps(step)
@@ -316,12 +401,13 @@ class _Loop:
         )
 
     def log_metrics(self) -> None:
-        """Fetch and write the metrics of the pending step; stop the run when too many were skipped
-        in a row.
+        """Fetch and write the metrics of the pending step.
+
+        Raises UserError when too many steps were skipped in a row.
         """
         if self.pending is None:
             return
-        (step, metrics, info) = self.pending
+        step, metrics, info = self.pending
         self.pending = None
         numbers = jax.device_get(metrics)
         if number := int(numbers.pop(_SIGNAL, 0)):
@@ -335,25 +421,26 @@ class _Loop:
         self.clock = now
         self.waited = 0.0
         self.row = self.record.write(step, {"loss": numbers["loss"]} | numbers | info | rate)
-        self.losses += [] if self.row["loss"] is None else [self.row["loss"]]
+        if self.row["loss"] is not None:
+            self.losses.append(self.row["loss"])
         self.advance(self.row)
         if self.record.in_a_row > self.config.run.max_skipped:
             raise UserError(
                 f"{self.record.in_a_row} steps in a row, up to step {step}, had a loss or a "
-                "gradient that is not "
-                "finite and were skipped. In another run folder, lower --optim.learning-rate, set "
-                "--optim.grad-clip, "
-                "or look for NaN in the data."
+                "gradient that is not finite and were skipped. In another run folder, lower "
+                "--optim.learning-rate, set --optim.grad-clip, or look for NaN in the data."
             )
 
     def save(self, done: int, state: TrainState, since: int) -> int:
-        """Write a checkpoint in the background, after the metrics of its `since` steps, and return
-        `done`.
+        """Write a checkpoint in the background, after the metrics of its `since` steps.
 
-        Its loss is the mean over these steps, marked `partial` for few steps: it could be the best
-        by chance.
+        Its loss is the mean over these steps, marked `partial` for few steps, because it could be
+        the best by chance. Returns `done`.
         """
+        # The lines come first: a checkpoint never has steps that metrics.jsonl lacks.
         self.log_metrics()
+        if self.checkpoints is None:
+            return done
         self.record.sync()
         metrics = {
             name: value for name, value in self.row.items() if isinstance(value, int | float)
@@ -371,32 +458,35 @@ class _Loop:
         """Draw figures. An error in them does not end the run."""
         if self.on_report is not None:
             self.log_metrics()
+            params = merge(state.trainable, state.frozen)
             try:
-                self.on_report(
-                    done, meshes.gather(merge(state.trainable, state.frozen)), meshes.gather(batch)
-                )
+                self.on_report(done, meshes.gather(params), meshes.gather(batch))
             except Exception as error:
                 self.log(f"no figures at step {done}: {type(error).__name__}: {error}")
         return done
 
 
 def _first_state(
-    config: Config, params: Tree, checkpoints: Checkpoints, mesh: Mesh
+    config: Config, work: Work, checkpoints: Checkpoints | None, mesh: Mesh
 ) -> tuple[TrainState, int]:
-    """Return the state of the latest complete checkpoint and its step, or a new state, sharded over
-    the mesh.
+    """Return the state of the latest checkpoint and its step, or a new one, sharded over the mesh.
+
+    A checkpoint counts when it is complete.
     """
-    init = functools.partial(init_state, config=config)
-    shapes = jax.eval_shape(init, params)
+    init = functools.partial(init_state, config=config, frozen=work.frozen)
+    shapes = jax.eval_shape(init, work.params)
     places = meshes.state_sharding(shapes, mesh)
-    if latest := meshes.broadcast(checkpoints.latest() or 0):
-        wanted = jax.tree.map(
-            lambda x, at: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=at), shapes, places
-        )
-        return checkpoints.restore(wanted, latest), latest
-    return jax.jit(init, out_shardings=places)(
-        meshes.put_state(params, meshes.state_sharding(params, mesh))
-    ), 0
+    if checkpoints is not None:
+        # All processes continue from the step that process 0 sees.
+        latest = meshes.broadcast(checkpoints.latest() or 0)
+        if latest:
+
+            def wanted(x: Any, at: Any) -> jax.ShapeDtypeStruct:
+                return jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=at)
+
+            return checkpoints.restore(jax.tree.map(wanted, shapes, places), latest), latest
+    params = meshes.put_state(work.params, meshes.state_sharding(work.params, mesh))
+    return jax.jit(init, out_shardings=places)(params), 0
 
 
 class LastStep:

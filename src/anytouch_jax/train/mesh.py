@@ -1,6 +1,4 @@
-"""Devices and processes of a run: the mesh, sharding over it, joining, one decision a step, and a
-lost process.
-"""
+"""Mesh of devices, sharding over it, and the processes of a run: joining, voting, losing one."""
 
 import contextlib
 import os
@@ -48,7 +46,8 @@ def make_mesh(
         raise ConfigError(
             f"a mesh of {data} x {fsdp} needs {data * fsdp} devices, but there are {len(devices)}"
         )
-    # jit places the computation: the default is explicit axes
+    # "auto" lets jit place the computation. With jax's default, explicit axes, every operation of
+    # the network would have to name its sharding.
     auto = (AxisType.Auto, AxisType.Auto)
     return jax.make_mesh((data, fsdp), BATCH_AXES, axis_types=auto, devices=devices[: data * fsdp])
 
@@ -73,9 +72,12 @@ def state_sharding(abstract_state: Tree, mesh: Mesh, *, small: int = SMALL) -> T
 
     def place(leaf: Any) -> NamedSharding:
         divisible = [(size, axis) for axis, size in enumerate(leaf.shape) if size % parts == 0]
-        if parts == 1 or not divisible or len(leaf.shape) < 2 or np.prod(leaf.shape) < small:
+        is_small = len(leaf.shape) < 2 or np.prod(leaf.shape) < small
+        # A small array costs more to gather than to keep.
+        if parts == 1 or not divisible or is_small:
             return replicated(mesh)
-        return NamedSharding(mesh, PartitionSpec(*[None] * max(divisible)[1], "fsdp"))
+        _, axis = max(divisible)
+        return NamedSharding(mesh, PartitionSpec(*[None] * axis, "fsdp"))
 
     return jax.tree.map(place, abstract_state)
 
@@ -97,10 +99,10 @@ def put_state(tree: Tree, places: Tree) -> Tree:
 
 
 def gathering(loss_fn: Callable[..., Any], mesh: Mesh) -> Callable[..., Any]:
-    """Return `loss_fn(params, ...)` that gathers sharded parameters just before their use (ZeRO,
-    Rajbhandari 2020).
+    """Return `loss_fn(params, ...)` that gathers sharded parameters just before their use.
 
-    XLA alone would shard activations along the axis of a parameter, and send twice the bytes.
+    This is ZeRO (Rajbhandari et al., 2020). XLA alone would shard activations along the axis of a
+    parameter, and send twice the bytes.
     """
     if mesh.shape["fsdp"] == 1:
         return loss_fn
@@ -112,10 +114,10 @@ def gathering(loss_fn: Callable[..., Any], mesh: Mesh) -> Callable[..., Any]:
 
 
 def donated() -> tuple[int, ...]:
-    """Return the arguments of a step that are donated, for `jax.jit(donate_argnums=...)`: the
-    state, on an accelerator.
+    """Return which arguments of a step are donated, for `jax.jit(donate_argnums=...)`.
 
-    On a CPU none is: XLA would copy every parameter and moment (`experiments/results/tried.md`).
+    On an accelerator it is the state. On a CPU none is: XLA would copy every parameter and moment
+    (`experiments/results/tried.md`).
     """
     if jax.default_backend() == "cpu":
         return ()
@@ -123,9 +125,9 @@ def donated() -> tuple[int, ...]:
 
 
 def put_batch(batch: Tree, sharding: NamedSharding) -> Tree:
-    """Send a host batch to the devices, a share of the rows of each process.
+    """Send a host batch to the devices, its rows over all of them.
 
-    Raises ConfigError for a remainder.
+    Each process has its own part of the rows. Raises ConfigError for a remainder.
     """
     devices = sharding.num_devices
     processes = jax.process_count()
@@ -155,7 +157,8 @@ def enable_compilation_cache(folder: Path | str | None = None) -> Path | None:
         return None
     remove_old(folder, "*-cache")
     jax.config.update("jax_compilation_cache_dir", str(folder))
-    # a program compiled before would have switched the cache off
+    # jax decides at its first compilation whether it has a cache. A program compiled before would
+    # have switched it off.
     compilation_cache.reset_cache()
     return folder
 
@@ -200,10 +203,11 @@ def joined(environ: Mapping[str, str] = os.environ) -> Iterator[_Process | None]
             sys.stdout.flush()
             sys.stderr.write(f"{process or 'this process'}: {message}\n")
             sys.stderr.flush()
-        if process and isinstance(
-            error, UserError
-        ):  # wait for the others: jax aborts one whose coordinator leaves
-            (thread := threading.Thread(target=_shutdown, daemon=True)).start()
+        if process and isinstance(error, UserError):
+            # All processes meet the same mistake. Wait for the others to report it, because jax
+            # aborts a process whose coordinator leaves.
+            thread = threading.Thread(target=_shutdown, daemon=True)
+            thread.start()
             thread.join(PATIENCE)
         # jax's threads and exit handlers would wait for processes that have ended
         os._exit(status)
@@ -228,9 +232,8 @@ def _initialize(environ: Mapping[str, str]) -> _Process:
     except (RuntimeError, ValueError, KeyError) as error:
         raise UserError(
             f"cannot join the other processes ({_first_line(error)}). Set JAX_COORDINATOR_ADDRESS "
-            "to host:port of "
-            "process 0, JAX_NUM_PROCESSES and JAX_PROCESS_ID, start all processes, and open that "
-            "port."
+            "to host:port of process 0, JAX_NUM_PROCESSES and JAX_PROCESS_ID, start all processes, "
+            "and open that port."
         ) from None
     return _Process(jax.process_count(), jax.process_index())
 
@@ -243,9 +246,8 @@ def _exit_message(error: BaseException) -> tuple[str, int]:
         return "stopped by SIGTERM before the first step", 0
     if isinstance(error, UserError):
         return str(error), 2
-    if isinstance(
-        error, jax.errors.JaxRuntimeError
-    ):  # a collective fails so when another process was lost
+    if isinstance(error, jax.errors.JaxRuntimeError):
+        # a collective fails so when another process was lost
         return f"{_first_line(error)}; if another process was lost, {_CONTINUE}", 1
     return "".join(traceback.format_exception(error)) + _CONTINUE, 1
 
@@ -268,13 +270,15 @@ def _first_line(error: BaseException) -> str:
 
 
 class Ballot:
-    """One vote of each process at each step, read a step later: the signal it received, and the
-    samples it skipped.
+    """All-reduce of two flags at each step: the signal a process received, its skipped samples.
+
+    All processes must leave the loop after the same step, or the next collective waits for ever.
+    The result is read a step later, so that no process waits for it.
     """
 
     def __init__(self, mesh: Mesh) -> None:
         self._sharding = batch_sharding(mesh)
-        # of one process: all cast the same vote
+        # The devices of a process hold the same vote, which counts once.
         devices = self._sharding.num_devices // jax.process_count()
         self._count = jax.jit(
             lambda votes: (jnp.max(votes[:, 0]), jnp.sum(votes[:, 1]) // devices),

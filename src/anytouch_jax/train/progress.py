@@ -1,6 +1,4 @@
-"""A run's folder (config.json, metrics.jsonl with one line a step, the lock), its progress, and
-signals that end it.
-"""
+"""Run folder (config.json, metrics.jsonl, the lock), progress on a terminal, and signals."""
 
 import contextlib
 import dataclasses
@@ -22,6 +20,9 @@ from anytouch_jax.files import atomic_write, lock
 from anytouch_jax.weights.checkpoint import read_record, steps
 
 Log = Callable[[str], None]
+Advance = Callable[[Mapping[str, Any]], None]  # gets the line of metrics of each step
+# (first step, last step) -> a function that shows the lines while the block runs
+Display = Callable[[int, int], contextlib.AbstractContextManager[Advance]]
 _WAIT_SHARE = 0.05  # a run that waits for data longer than this share of its time reports it
 
 
@@ -36,11 +37,10 @@ def silent(sentence: str) -> None:
 
 
 @contextlib.contextmanager
-def progress(
-    start: int, stop: int, log: Log, *, curve: bool = False
-) -> Iterator[Callable[[Mapping[str, Any]], None]]:
-    """Give a function for the metrics of each step: a bar on a terminal (with a `curve` of the
-    loss), or log lines.
+def progress(start: int, stop: int, log: Log, *, curve: bool = False) -> Iterator[Advance]:
+    """Give a function for the metrics of each step, which shows a bar or logs some twenty lines.
+
+    The bar is on a terminal, with a `curve` of the loss above it.
     """
     if log is silent or not sys.stderr.isatty():
         every = max(1, (stop - start) // 20)
@@ -73,7 +73,8 @@ def progress(
             yield self.make_tasks_table(self.tasks)
 
     def advance(row: Mapping[str, Any]) -> None:
-        losses.extend(() if row["loss"] is None else (row["loss"],))
+        if row["loss"] is not None:
+            losses.append(row["loss"])
         bar.update(task, completed=row["step"] + 1, description=summary(row))
 
     columns = (
@@ -92,35 +93,36 @@ def chart(losses: Sequence[float], width: int = 64, height: int = 8) -> str:
 
     The scale is written on the left.
     """
-    columns = [
-        float(part.mean()) for part in np.array_split(np.asarray(losses), min(width, len(losses)))
-    ]
+    parts = np.array_split(np.asarray(losses), min(width, len(losses)))
+    columns = [float(part.mean()) for part in parts]
     low = min(columns)
     high = max(columns)
-    eighths = [
-        1 + round((8 * height - 1) * (value - low) / ((high - low) or 1.0)) for value in columns
-    ]
+    span = (high - low) or 1.0
+    # A letter is 8 steps high, so a column is 1 to 8 * height of them.
+    eighths = [1 + round((8 * height - 1) * (value - low) / span) for value in columns]
     lines = []
     for line in reversed(range(height)):
-        mark = {height - 1: f"{high:9.4f} ", 0: f"{low:9.4f} "}.get(line, " " * 10)
-        lines.append(
-            mark + "".join(" ▁▂▃▄▅▆▇█"[min(8, max(0, full - 8 * line))] for full in eighths)
-        )
+        mark = " " * 10
+        if line == height - 1:
+            mark = f"{high:9.4f} "
+        elif line == 0:
+            mark = f"{low:9.4f} "
+        blocks = [" ▁▂▃▄▅▆▇█"[min(8, max(0, full - 8 * line))] for full in eighths]
+        lines.append(mark + "".join(blocks))
     return "\n".join(lines)
 
 
 def summary(row: Mapping[str, Any]) -> str:
     """Return the loss, the speed and the problems of a line of metrics."""
     loss = "not finite" if row["loss"] is None else f"{row['loss']:.4f}"
-    skipped = f"  skipped {row['skipped_batches']}" if row["skipped_batches"] else ""
-    replaced = row.get("skipped_samples", 0)
-    skipped += f"  {replaced:.0f} samples could not be read and were replaced" if replaced else ""
-    waits = (
-        f"  waits for data {row['wait_share']:.0%}"
-        if row.get("wait_share", 0) >= _WAIT_SHARE
-        else ""
-    )
-    return f"loss {loss}  {row['samples_per_second']:.0f} samples/s{skipped}{waits}"
+    parts = [f"loss {loss}", f"{row['samples_per_second']:.0f} samples/s"]
+    if row["skipped_batches"]:
+        parts.append(f"skipped {row['skipped_batches']}")
+    if replaced := row.get("skipped_samples", 0):
+        parts.append(f"{replaced:.0f} samples could not be read and were replaced")
+    if row.get("wait_share", 0) >= _WAIT_SHARE:
+        parts.append(f"waits for data {row['wait_share']:.0%}")
+    return "  ".join(parts)
 
 
 @contextlib.contextmanager
@@ -159,11 +161,18 @@ def terminating() -> Iterator[None]:
 # numbers. `pretrain` compares the content of the manifests, since a data set may have moved. The
 # run folder has a copy of the tokenizer.
 CHANGEABLE = {
-    f"data.{name}"
-    for name in ("cache", "manifests", "on_bad_sample", "prefetch", "threads", "tokenizer")
-}
-CHANGEABLE |= {
-    f"run.{n}" for n in ("figure_every", "fsdp", "keep", "max_skipped", "save_every", "tensorboard")
+    "data.cache",
+    "data.manifests",
+    "data.on_bad_sample",
+    "data.prefetch",
+    "data.threads",
+    "data.tokenizer",
+    "run.figure_every",
+    "run.fsdp",
+    "run.keep",
+    "run.max_skipped",
+    "run.save_every",
+    "run.tensorboard",
 }
 
 
@@ -176,11 +185,11 @@ def writing(path: Path) -> Iterator[None]:
         reason = error.strerror or str(error)
         raise UserError(
             f"cannot write {path}: {reason}. Free some space or make the folder writable, then run "
-            "the same command "
-            "again to continue from the last complete checkpoint."
+            "the same command again to continue from the last complete checkpoint."
         ) from error
 
 
+# (thread, folder): `pretrain` locks the folder before `fit` does, which would find it taken.
 _locked: set[tuple[int, Path]] = set()
 
 
@@ -246,7 +255,8 @@ def continues(run_dir: Path, config: Config) -> bool:
 
     Raises UserError for changed settings, but those CHANGEABLE.
     """
-    if (begun := begun_with(run_dir)) is None:
+    begun = begun_with(run_dir)
+    if begun is None:
         return False
     before = _flat(dataclasses.asdict(begun))
     now = _flat(dataclasses.asdict(config))
@@ -256,12 +266,12 @@ def continues(run_dir: Path, config: Config) -> bool:
         if name not in CHANGEABLE and before.get(name) != now.get(name)
     ]
     if changed:
-        longer = f", or start from its weights by --init {run_dir} and another --run folder"
+        advice = ""
+        if before["run.steps"] != now["run.steps"]:
+            advice = f", or start from its weights by --init {run_dir} and another --run folder"
         raise UserError(
             f"the run in {run_dir} was started with other settings: {'; '.join(changed)}. Use the "
-            "same settings to "
-            "continue it, or choose another run "
-            f"folder{longer if before['run.steps'] != now['run.steps'] else ''}."
+            f"same settings to continue it, or choose another run folder{advice}."
         )
     return True
 
@@ -270,33 +280,43 @@ def _flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Return a nested dict as {dotted name: value}, with lists as tuples."""
     flat: dict[str, Any] = {}
     for name, value in tree.items():
-        value = tuple(value) if isinstance(value, list) else value
-        flat |= (
-            _flat(value, f"{prefix}{name}.")
-            if isinstance(value, Mapping)
-            else {prefix + name: value}
-        )
+        if isinstance(value, Mapping):
+            flat |= _flat(value, f"{prefix}{name}.")
+        elif isinstance(value, list):
+            flat[prefix + name] = tuple(value)
+        else:
+            flat[prefix + name] = value
     return flat
 
 
 class Record:
     """metrics.jsonl from step `start` on. Later and incomplete lines, of a killed run, are removed.
 
-    `skipped` counts the skipped steps so far, and `in_a_row` those at the end without a break. With
-    `tensorboard` the numbers also go to an event file. Only the `lead` process writes. Raises
+    `skipped` counts the skipped steps so far, and `in_a_row` those at the end without a break.
+    `losses` are those of every step, and `last` is the latest line. With `tensorboard` the numbers
+    also go to an event file. Only the `lead` process writes, and nobody without a `run_dir`. Raises
     UserError for a full disk.
     """
 
     def __init__(
-        self, run_dir: Path, start: int, *, tensorboard: bool = False, lead: bool = True
+        self, run_dir: Path | None, start: int, *, tensorboard: bool = False, lead: bool = True
     ) -> None:
+        self.skipped = 0
+        self.in_a_row = 0
+        self.losses: list[float] = []
+        self.last: dict[str, Any] = {}
+        self._board: Any = None
+        self._file: TextIO | None = None
+        if run_dir is None:
+            return
         self.path = run_dir / "metrics.jsonl"
-        self.skipped = self.in_a_row = 0
-        self._board = _tensorboard(run_dir, start) if tensorboard and lead else None
+        if tensorboard and lead:
+            self._board = _tensorboard(run_dir, start)
         with writing(self.path):
             for row in _cut(self.path, start, rewrite=lead):
                 self._count(row)
-            self._file: TextIO | None = self.path.open("a", encoding="utf-8") if lead else None
+            if lead:
+                self._file = self.path.open("a", encoding="utf-8")
 
     def write(self, step: int, numbers: Mapping[str, Any]) -> dict[str, Any]:
         """Append the line of a step and return it.
@@ -305,8 +325,11 @@ class Record:
         """
         row: dict[str, Any] = {"step": step}
         for name, value in numbers.items():
-            value = value.item() if hasattr(value, "item") else value
-            row[name] = None if isinstance(value, float) and not math.isfinite(value) else value
+            if hasattr(value, "item"):
+                value = value.item()
+            if isinstance(value, float) and not math.isfinite(value):
+                value = None
+            row[name] = value
         self._count(row)
         row["skipped_batches"] = self.skipped
         if self._file:
@@ -333,17 +356,21 @@ class Record:
                     file.close()
 
     def _count(self, row: Mapping[str, Any]) -> None:
-        self.in_a_row = self.in_a_row + 1 if row.get("skipped") else 0
-        self.skipped += bool(row.get("skipped"))
+        loss = row.get("loss")
+        self.losses.append(math.nan if loss is None else loss)
+        self.last = dict(row)
+        if row.get("skipped"):
+            self.skipped += 1
+            self.in_a_row += 1
+        else:
+            self.in_a_row = 0
 
 
 def _cut(path: Path, start: int, *, rewrite: bool) -> list[dict[str, Any]]:
     """Remove the lines of step `start` and later, and incomplete ones, and return the rest."""
-    lines = (
-        path.read_text(encoding="utf-8", errors="replace").splitlines(keepends=True)
-        if path.exists()
-        else []
-    )
+    if not path.exists():
+        return []
+    lines = path.read_text(encoding="utf-8", errors="replace").splitlines(keepends=True)
     rows: dict[str, dict[str, Any]] = {}
     for line in lines:
         with contextlib.suppress(ValueError):

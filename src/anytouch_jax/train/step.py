@@ -1,6 +1,4 @@
-"""Training steps as pure functions: loss and gradients, accumulation, the update and its
-metrics.
-"""
+"""Training steps as pure functions: loss, gradients, accumulation, update and its metrics."""
 
 from __future__ import annotations
 
@@ -23,15 +21,17 @@ Tree = Any
 # (params, batch, key, progress) -> scalar loss and a dict of scalar metrics
 LossAndMetrics = tuple[Array, dict[str, Array]]
 LossFn = Callable[[Tree, Any, Array, Array], LossAndMetrics]
-# batch -> rules (regex over parameter names, trained?)
-TrainedFn = Callable[[Any], Sequence[tuple[str, bool]]]
+Rules = Sequence[tuple[str, bool]]  # (regex over parameter names, answer); the first match decides
+# batch -> rules: is it trained?
+TrainedFn = Callable[[Any], Rules]
 StepFn = Callable[..., tuple["TrainState", dict[str, Array]]]
 
 
 @shown_short
 class TrainState(NamedTuple):
-    """The state of training: `step` i32 (), trainable and frozen parameters as nested dicts, the
-    optimiser's state.
+    """State of training: parameters as nested dicts, and the state of the optimiser.
+
+    `step` i32 () is the number of steps that are done, skipped ones too.
     """
 
     step: Array
@@ -40,16 +40,12 @@ class TrainState(NamedTuple):
     opt_state: Any
 
 
-def split(params: Tree, rules: Sequence[tuple[str, bool]]) -> tuple[Tree, Tree]:
-    """Split nested parameters into (trainable, frozen) by (regex, frozen?) rules.
-
-    The first match decides.
-    """
+def split(params: Tree, rules: Rules) -> tuple[Tree, Tree]:
+    """Split nested parameters into (trainable, frozen) by rules (regex, frozen?)."""
     leaves = flatten(params)
     frozen = match_rules(rules, leaves)
-    trainable, fixed = (
-        {name: leaves[name] for name in leaves if frozen[name] == part} for part in (False, True)
-    )
+    trainable = {name: leaf for name, leaf in leaves.items() if not frozen[name]}
+    fixed = {name: leaf for name, leaf in leaves.items() if frozen[name]}
     return nest(trainable), nest(fixed)
 
 
@@ -69,13 +65,15 @@ def merge(trainable: Tree, frozen: Tree) -> Tree:
     return merged
 
 
-def init_state(params: Tree, config: Config) -> TrainState:
-    """Return the state before the first step: parameters split by `config.frozen`, moments zero."""
+def init_state(params: Tree, config: Config, frozen: Rules | None = None) -> TrainState:
+    """Return the state before the first step: parameters split, moments zero.
+
+    `frozen` are rules (regex, frozen?), those of the configuration by default.
+    """
     refuse_forked()
-    trainable, frozen = split(params, config.frozen)
-    return TrainState(
-        jnp.zeros((), jnp.int32), trainable, frozen, optimizer(config).init(trainable)
-    )
+    trainable, fixed = split(params, config.frozen if frozen is None else frozen)
+    step = jnp.zeros((), jnp.int32)
+    return TrainState(step, trainable, fixed, optimizer(config).init(trainable))
 
 
 def make_step(
@@ -89,17 +87,25 @@ def make_step(
     """Return `step(state, batch, seed_key) -> (state, metrics)`, pure and ready for jit.
 
     The loss gets `key = fold_in(seed_key, step)` and `progress = step / total_steps`. A run for a
-    time passes the share of its time as `progress`, which then decides the learning rate too. Only
-    trainable parameters are differentiated. Those that a batch does not train by the rules of
-    `trained` (`objectives.trained_by`) are skipped, as in PyTorch (golden H_mixed). If the loss, or
-    the norm of gradients or parameters, is not finite, no update is applied, `step` advances and
-    `skipped` is 1. Metrics are f32 scalars: those of the loss, loss, grad_norm, param_norm (before
-    the update), update_norm, learning_rate, skipped.
+    time passes the ratio of its time as a fourth argument, which then decides the learning rate
+    too. If the loss, or the norm of gradients or parameters, is not finite, no update is applied,
+    `step` advances and `skipped` is 1. Metrics are f32 scalars: those of the loss, loss, grad_norm,
+    param_norm (before the update), update_norm, learning_rate, skipped.
 
-    `accumulate` micro-batches (rows m, m + accumulate, ...) run in turn, and their losses,
-    gradients and metrics are averaged: equal to the large batch for a mean over rows, not for
-    InfoNCE. Raises ConfigError for rows that do not divide, and for packed image or text slots.
-    `optax.MultiSteps` would need several calls.
+    Args:
+        loss_fn: (params, batch, key, progress) -> scalar loss and metrics. Only trainable
+            parameters are differentiated.
+        tx: The optimiser, `optimizer` or one of optax.
+        total_steps: Steps of the whole schedule.
+        accumulate: Micro-batches (rows m, m + accumulate, ...) that run in turn. Their losses,
+            gradients and metrics are averaged, which equals the large batch for a mean over rows,
+            not for InfoNCE. `optax.MultiSteps` would need several calls.
+        trained: `objectives.trained_by`. Parameters that a batch does not train by its rules are
+            skipped, as PyTorch skips those whose gradient is None.
+
+    Raises:
+        ConfigError: While tracing, for rows that `accumulate` does not divide, and for packed
+            image or text slots with it.
     """
     tx = optax.with_extra_args_support(tx)
 
@@ -107,30 +113,35 @@ def make_step(
         state: TrainState, batch: Any, seed_key: Array, progress: Array | None = None
     ) -> tuple[TrainState, dict[str, Array]]:
         refuse_forked()
+        # The step itself is in the key: a run that continues draws what it would have drawn.
         key = jax.random.fold_in(seed_key, state.step)
-        at = state.step if progress is None else progress * total_steps
+        at: Array = state.step
         if progress is None:
             progress = state.step.astype(jnp.float32) / total_steps
+        else:
+            at = progress * total_steps
 
         def loss(
             trainable: Tree, frozen: Tree, part: Any, key: Array, progress: Array
         ) -> LossAndMetrics:
             value, metrics = loss_fn(merge(trainable, frozen), part, key, progress)
-            return value.astype(jnp.float32), {
-                k: jnp.asarray(v, jnp.float32) for k, v in metrics.items()
-            }
+            metrics = {k: jnp.asarray(v, jnp.float32) for k, v in metrics.items()}
+            return value.astype(jnp.float32), metrics
 
-        parts = batch if accumulate == 1 else micro_batches(batch, accumulate)
-        used = nest(match_rules(trained(batch), flatten(state.trainable))) if trained else None
+        used = None
+        if trained is not None:
+            used = nest(match_rules(trained(batch), flatten(state.trainable)))
         function = jax.value_and_grad(loss, has_aux=True)
 
         def gradients(part: Any, key: Array) -> tuple[Array, dict[str, Array], Tree]:
             (value, metrics), grads = function(state.trainable, state.frozen, part, key, progress)
             return value, metrics, grads
 
-        value, metrics, grads = (
-            gradients(parts, key) if accumulate == 1 else _mean_over(gradients, parts, key)
-        )
+        if accumulate == 1:
+            value, metrics, grads = gradients(batch, key)
+        else:
+            parts = micro_batches(batch, accumulate)
+            value, metrics, grads = _mean_over(gradients, parts, key)
         layout = packing(state.trainable)
         norms = {
             "grad_norm": global_norm(layout.pack(grads)),
@@ -154,13 +165,16 @@ def _finish(
     state: TrainState, good: Array, metrics: dict[str, Array], updates: Tree, opt_state: Any
 ) -> tuple[TrainState, dict[str, Array]]:
     """Apply the update if `good`, and return the new state and its metrics."""
+    # an optimiser of optax keeps its learning rate to itself
     rate = getattr(opt_state, "learning_rate", jnp.nan)
 
     def kept(new: Tree, old: Tree) -> Tree:
         return jax.tree.map(lambda a, b: jnp.where(good, a, b), new, old)
 
     trainable = kept(optax.apply_updates(state.trainable, updates), state.trainable)
-    opt_state = opt_state if isinstance(opt_state, OptState) else kept(opt_state, state.opt_state)
+    # Ours has kept its own moments, inside the same loop over elements that computes them.
+    if not isinstance(opt_state, OptState):
+        opt_state = kept(opt_state, state.opt_state)
     metrics = metrics | {
         "update_norm": jnp.where(good, global_norm(packing(updates).pack(updates)), 0.0),
         "learning_rate": jnp.asarray(rate),
@@ -180,8 +194,7 @@ def micro_batches(batch: Any, accumulate: int) -> Any:
         if isinstance(part, AlignBatch) and part.image.shape[0] + part.text.shape[0] > 0:
             raise ConfigError(
                 "--optim.accumulate must be 1 for batches with images or texts, whose slots refer "
-                "to rows of the whole "
-                "batch. Lower --batch instead."
+                "to rows of the whole batch. Lower --batch instead."
             )
 
     def deal(x: Array) -> Array:
@@ -195,8 +208,9 @@ def micro_batches(batch: Any, accumulate: int) -> Any:
 
 
 def _mean_over(gradients: Callable[[Any, Array], Any], parts: Any, key: Array) -> Any:
-    """Return the mean of (loss, metrics, gradients) over micro-batches, one at a time, each with
-    its own key.
+    """Return the mean of (loss, metrics, gradients) over micro-batches, each with its own key.
+
+    They run one at a time, so that the memory is that of one.
     """
     count = jax.tree.leaves(parts)[0].shape[0]
     keys = jax.vmap(lambda i: jax.random.fold_in(key, i))(jnp.arange(count))

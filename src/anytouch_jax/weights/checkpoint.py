@@ -74,9 +74,19 @@ def quiet_hook(hook: Callable[..., Any]) -> Callable[..., Any]:
     return quiet
 
 
-# Orbax logs the traceback of every error in its threads, which it raises too.
-logging.getLogger("absl").addFilter(lambda record: "_SignalingThread" not in record.getMessage())
-sys.excepthook = quiet_hook(sys.excepthook)
+_is_quiet = False
+
+
+def _quieten() -> None:
+    """Let errors of Orbax be told once, by us. It is done when Orbax is first used."""
+    global _is_quiet
+    if _is_quiet:
+        return
+    _is_quiet = True
+    # Orbax logs the traceback of every error in its threads, which it raises too.
+    absl = logging.getLogger("absl")
+    absl.addFilter(lambda record: "_SignalingThread" not in record.getMessage())
+    sys.excepthook = quiet_hook(sys.excepthook)
 
 
 class Checkpoints:
@@ -109,9 +119,8 @@ class Checkpoints:
         if disk.total and disk.free < needed and jax.process_count() == 1:
             raise CheckpointError(
                 f"cannot write a checkpoint in {self.folder}: the disk is full. It needs "
-                f"{needed:,} bytes and has "
-                f"{disk.free:,}. Free some space and run the same command again. Older checkpoints "
-                "are untouched."
+                f"{needed:,} bytes and has {disk.free:,}. Free some space and run the same command "
+                "again. Older checkpoints are untouched."
             )
 
     def save(self, step: int, state: Tree, metrics: Mapping[str, Any]) -> None:
@@ -170,7 +179,8 @@ class Checkpoints:
         with self._one_sentence(target):
             try:
                 future.result()
-            finally:  # also after a failure: the other processes are waiting for process 0 to rename
+            # Also after a failure: the other processes are waiting for process 0 to rename.
+            finally:
                 if jax.process_count() > 1:
                     from jax.experimental import multihost_utils
 
@@ -342,6 +352,7 @@ def _acquire_orbax() -> Callable[[], None]:
     """Wait until no other operation of Orbax runs; return its release, which any thread may call,
     also twice.
     """
+    _quieten()
     stack = ExitStack()
     stack.callback(_ORBAX.release)
     _ORBAX.acquire()
@@ -367,6 +378,7 @@ def _load(folder: Path, wanted: Mapping[str, Any]) -> dict[str, Any]:
 
     Raises CheckpointError for other shapes.
     """
+    _quieten()
     # a wrong JAX_PLATFORMS is no fault of the checkpoint
     jax.local_devices()
     context = ocp.Context()
@@ -422,8 +434,7 @@ def _compare(folder: Path, wanted: Mapping[str, Any], stored: Mapping[str, Any])
     if differing:
         raise CheckpointError(
             f"checkpoint {folder} does not fit this configuration, use the preset and settings it "
-            "was trained with; "
-            f"{len(differing)} entries differ "
+            f"was trained with; {len(differing)} entries differ "
             f"({'; '.join(differing[:_LISTED])}{'; ...' * (len(differing) > _LISTED)})"
         )
 

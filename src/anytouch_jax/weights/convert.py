@@ -107,9 +107,8 @@ def refuse_unknown(stacks: Mapping[str, int]) -> None:
         example = ", ".join(f'"{name}": {{"heads": N}}' for name in stacks)
         raise WeightsError(
             f"the weights do not store the number of attention heads of {names}. Write it to a "
-            "config.json "
-            f'in its folder, as {{"model": {{{example}}}}}. Or write the file by `anytouch export --to safetensors`, '
-            "which stores it."
+            f'config.json in its folder, as {{"model": {{{example}}}}}. Or write the file by '
+            "`anytouch export --to safetensors`, which stores it."
         )
 
 
@@ -267,7 +266,9 @@ def _hint(keys: Sequence[str]) -> str:
         r".*sensor_token_proj\.weight": "model.decoder_sensor_tokens",
         r".*lora_[AB].*": "model.lora_rank",
         r"cross_sensor_(head|mlp)\..*": "model.match_head",
-        r".*\.(layers|resblocks|touch_decoder_blocks)\.\d+\..*": "the depths of the model (or another preset)",
+        r".*\.(layers|resblocks|touch_decoder_blocks)\.\d+\..*": (
+            "the depths of the model (or another preset)"
+        ),
     }
     matching = (
         setting
@@ -346,8 +347,8 @@ def check_clip(path: Path, clip: ModelConfig, config: Config, *, touch: bool) ->
         ]
         raise UserError(
             f"the image tower in {path} has {sizes[0]}, this run's {name} {sizes[1]}: --preset "
-            "large fits ViT-L/14, "
-            "--preset base fits ViT-B/16; add the one that fits, or give other --clip-weights"
+            "large fits ViT-L/14, --preset base fits ViT-B/16; add the one that fits, or give "
+            "other --clip-weights"
         )
 
 

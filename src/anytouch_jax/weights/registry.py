@@ -179,15 +179,21 @@ def write_encoder(
     return folder
 
 
+# What a model card says of the picture of the untouched gel, by `data.background`.
+_SUBTRACTED = {
+    "subtract": "It needs the picture of the untouched gel, which is subtracted.",
+    "either": (
+        "A picture of the untouched gel is subtracted if you give one. It also works without."
+    ),
+    "keep": "The picture of the untouched gel is not used.",
+}
+
+
 def _page(card: Mapping[str, Any], notes: str) -> str:
     """Return the model card in the form of the hub: a header that machines read, then Markdown."""
     count = sum(card["parameters"].values())
     sensors = card["trained_sensors"]
-    subtracted = {
-        "subtract": "It needs the picture of the untouched gel, which is subtracted.",
-        "either": "A picture of the untouched gel is subtracted if you give one. It also works without.",
-        "keep": "The picture of the untouched gel is not used.",
-    }[card["background"]]
+    subtracted = _SUBTRACTED[card["background"]]
     given = ", background" if card["background"] == "subtract" else ""
     return f"""---
 library_name: anytouch_jax
@@ -202,7 +208,8 @@ An encoder of touch for camera-based tactile sensors, by AnyTouch (ICLR 2025) in
 import anytouch_jax as at
 
 encoder = at.load_encoder("{card["name"]}")
-features = encoder.encode_touch(encoder.preprocess(frame{given}), "digit")  # (1, {card["features"]})
+features = encoder.encode_touch(encoder.preprocess(frame{given}), "digit")
+print(features.shape)  # (1, {card["features"]})
 ```
 
 | | |

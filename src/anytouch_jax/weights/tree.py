@@ -64,8 +64,7 @@ def interpolate(
         if np.shape(start[name]) != np.shape(end[name]):
             raise UserError(
                 f"{name} has shape {np.shape(start[name])} in one and {np.shape(end[name])} in the "
-                "other; "
-                "give two models of one configuration"
+                "other; give two models of one configuration"
             )
         end[name] = (1 - share) * np.asarray(start[name]) + share * np.asarray(end[name])
     return nest(end)

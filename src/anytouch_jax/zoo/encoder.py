@@ -76,8 +76,10 @@ class FamilyEncoder(Encoder):
         """
         shape = ", ".join(map(str, self.image_size))
         return {
-            "input": f"frames: float32 (B, {frames}, {shape}, 3), oldest first, each from encoder.preprocess of "
-            f"{self.family.title}; sensor: int32 (B,)",
+            "input": (
+                f"frames: float32 (B, {frames}, {shape}, 3), oldest first, each from "
+                f"encoder.preprocess of {self.family.title}; sensor: int32 (B,)"
+            ),
             "preparation": asdict(self.preparation),
             "frame_shape": [*self.image_size, 3],
             "frame_dtype": "float32",
@@ -213,8 +215,7 @@ class FamilyEncoder(Encoder):
             high, wide = self.image_size
             raise UserError(
                 f"frames must be float32 of {high} x {wide} pixels, (B, T, {high}, {wide}, 3), not "
-                f"{frames.dtype} "
-                f"{frames.shape}; prepare each frame with encoder.preprocess(frame)"
+                f"{frames.dtype} {frames.shape}; prepare each frame with encoder.preprocess(frame)"
             )
         return frames
 
@@ -270,8 +271,7 @@ class FamilyEncoder(Encoder):
         elif given != count:
             raise UserError(
                 f"{self.family.title} takes 1 frame, {count} frames ({stride} apart), or at least "
-                f"{span} consecutive "
-                f"ones, not {given}"
+                f"{span} consecutive ones, not {given}"
             )
         return (clips[:, ::-1] if self.preparation.newest_first else clips)[:, None]
 
@@ -279,9 +279,8 @@ class FamilyEncoder(Encoder):
         if self.form.calibration and self.calibration is None:
             raise UserError(
                 f"{self.family.title} needs the calibration images of the sensor: "
-                "encoder.calibrated(frames, "
-                "background), or a folder calibration beside the weights with 0000.png (the "
-                "untouched gel) to 0018.png"
+                "encoder.calibrated(frames, background), or a folder calibration beside the "
+                "weights with 0000.png (the untouched gel) to 0018.png"
             )
         network = self.part
         more = () if self.calibration is None else (jnp.asarray(self.calibration),)

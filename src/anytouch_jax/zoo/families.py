@@ -1,6 +1,4 @@
-"""Families of encoders that others published: how their files are recognised and read, and how they
-are fed.
-"""
+"""Encoders of other families: their files are recognised and read by the table of `zoo.table`."""
 
 from __future__ import annotations
 
@@ -10,217 +8,34 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
-from anytouch_jax.config import (
-    CLIP_MEAN,
-    CLIP_STD,
-    IMAGENET_MEAN,
-    IMAGENET_STD,
-    UNIVERSAL,
-    Config,
-    ModelConfig,
-    Stack,
-)
-from anytouch_jax.config.parsing import Above0, Count, check, read_value
-from anytouch_jax.errors import ConfigError, UserError
+from anytouch_jax.config import UNIVERSAL, ModelConfig, Stack
+from anytouch_jax.config.parsing import read_value
+from anytouch_jax.errors import ConfigError
 from anytouch_jax.nn.functional import Part
-from anytouch_jax.nn.vit import Resample, Vit, VitConfig
-from anytouch_jax.weights import convert, keymaps, load, registry
-from anytouch_jax.weights.convert import KEYMAPS, check_arrays, file_shapes, fill, refuse_unknown
-from anytouch_jax.weights.keymaps import VISION_HEADS, Entry, Shape, Weights, each_layer, find_depth
-from anytouch_jax.weights.safetensors import WeightsError
-from anytouch_jax.weights.tree import flatten, nest
-
-Size = tuple[int, int]
-ALIASES = {"mini": "gelsight_mini"}  # names of T3's files
-SHARED = ("trunk", "post_norm")  # what T3's sensors have in common
-_HEADS = {192: 3, 1152: 16} | VISION_HEADS
-
-
-@dataclass(frozen=True)
-class Preparation:
-    """How a family prepares a frame RGB u8, in this order.
-
-    A config.json may change it (`"preparation"`).
-
-    `difference`: Sparsh's frame - background + 127 in whole grey levels, AnyTouch 2's + 130 in
-    floats, or SITR's plain difference without an offset, in grey levels.
-    """
-
-    background: Literal["keep", "subtract", "either"] = "keep"
-    difference: Literal["none", "levels", "offset", "plain"] = "none"
-    portrait: bool = False  # Rotate a frame that is wider than high by 90 degrees clockwise.
-    crop: Literal["none", "rows", "centre", "square"] = "none"
-    # Shorter side before a centre crop. None: 8/7 of the image size.
-    shorter: Count[int] | None = None
-    filter: Literal["nearest", "lanczos", "bilinear", "bicubic", "box", "hamming"] = "bilinear"
-    mean: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    std: Above0[tuple[float, float, float]] = (1.0, 1.0, 1.0)
-    # The order of the frames for the network. Clips are given oldest first.
-    newest_first: bool = False
-    stride: Count[int] = 1  # Distance of the frames of a clip.
-
-    def __post_init__(self) -> None:
-        check(self)
-
-
-@dataclass(frozen=True)
-class Family:
-    """One layout of a family's files.
-
-    A file is of the family if, after one of the `prefixes`, it has all keys in `needs` and none in
-    `lacks`, and `beside` without the prefix. The patch kernel, first of `needs`, has five axes for
-    `video`. Keys in `unused` (a regex) are not read. `renamed` comes first.
-    """
-
-    name: str
-    title: str
-    licence: str
-    sensors: str  # What it was trained on, in words.
-    table: tuple[Entry, ...]
-    needs: tuple[str, ...]
-    preparation: Preparation
-    lacks: tuple[str, ...] = ()
-    beside: str | None = None
-    prefixes: tuple[str, ...] = ("",)
-    unused: str = ""
-    eps: float = 1e-6
-    resample: Resample = "none"
-    image_size: Size | None = None  # None: that of the stored positions.
-    frames: int = 1
-    video: bool = False
-    names: tuple[str, ...] = ()  # Sensors of the rows of tokens.
-    feature: Literal["class", "mean", "projected", "unit", "pooled"] = "class"
-    tokens: Literal["normed", "patches", "hidden"] = "normed"
-    # Other spellings of keys: a regex, and the key of the table.
-    renamed: tuple[tuple[str, str], ...] = ()
-    activation: str = "gelu"
-    bare_class: bool = False  # The stored positions have none of the class token.
-
-    def weights(self, weights: Weights) -> dict[str, np.ndarray] | None:
-        """Return the arrays of the encoder without their prefix, None if the file is of another
-        family.
-        """
-        if self.beside is not None and self.beside not in weights:
-            return None
-        for prefix in self.prefixes:
-            own = {
-                key.removeprefix(prefix): x for key, x in weights.items() if key.startswith(prefix)
-            }
-            for spelling, ours in self.renamed:
-                own = {re.sub(spelling, ours, key): x for key, x in own.items()}
-            if not own.keys() >= {*self.needs} or own.keys() & {*self.lacks}:
-                continue
-            if (own[self.needs[0]].ndim == 5) == self.video:
-                return {key: x for key, x in own.items() if not re.fullmatch(self.unused, key)}
-        return None
-
-
-# fmt: off
-_APACHE = "Apache-2.0"
-_NON_COMMERCIAL = "CC BY-NC 4.0: non-commercial"
-_IMAGES = "photographs, no touch"
-_TIMM_NEEDS = ("patch_embed.proj.weight", "cls_token", "pos_embed", "blocks.0.attn.qkv.weight")
-_HF_NEEDS = ("embeddings.patch_embeddings.projection.weight", "embeddings.cls_token")
-_PARTS = r"(head|head_dist|fc_norm|pooler|classifier|decoder\w*)\..*|(decoder_pos_embed|mask_token)"
-_PHOTO = Preparation(crop="centre", filter="bicubic", mean=IMAGENET_MEAN, std=IMAGENET_STD)
-_DINOV2: dict[str, Any] = {"unused": r"mask_token|embeddings\.mask_token", "image_size": (224, 224)}
-_DINOV3: dict[str, Any] = {
-    "unused": r"(embeddings\.)?mask_token|local_cls_norm\..*|.*\.bias_mask", "image_size": (224, 224), "eps": 1e-5,
-    "lacks": ("pos_embed",), "preparation": Preparation(filter="bicubic", mean=IMAGENET_MEAN, std=IMAGENET_STD),
-    "renamed": (
-        (r"rope_embed\.periods", "periods"), ("storage_tokens|reg_token", "register_tokens"),
-        (r"\.gamma_(\d)", r".ls\1.gamma"), (r"^model\.layer\.", "layer."),
-    ),
-}
-_HF_VIT: dict[str, Any] = {"prefixes": ("vit.", "deit.", ""), "unused": _PARTS, "eps": 1e-12, "resample": "bicubic"}
-FAMILIES = (
-    *(
-        Family(
-            "sparsh", title, _NON_COMMERCIAL, "DIGIT, GelSight, GelSight Mini",
-            table, ("patch_embed.proj.weight", "blocks.0.ls1.gamma"),
-            Preparation("either", "levels", portrait=True, crop="rows", newest_first=True, stride=stride),
-            prefixes=("teacher_encoder.backbone.", "target_encoder.backbone.", "target_encoder.", "encoder.", ""),
-            lacks=("cls_token",), unused="mask_token", image_size=(320, 240), frames=frames, video=frames == 4,
-            feature="mean", tokens="patches",
-        )
-        for title, table, frames, stride in (("Sparsh", keymaps.SPARSH, 2, 5),
-                                             ("Sparsh V-JEPA", keymaps.SPARSH_VIDEO, 4, 2))
-    ),
-    Family(
-        "anytouch2", "AnyTouch 2", "MIT", "GelSight, DIGIT, GelSight Mini, DuraGel by tokens",
-        keymaps.ANYTOUCH2, ("touch_model.embeddings.patch_embedding.weight", "sensor_token"),
-        # not ImageNet's, unlike AnyTouch
-        Preparation("subtract", "offset", mean=CLIP_MEAN, std=CLIP_STD),
-        lacks=("video_patch_embedding.weight",), prefixes=("touch_mae_model.",), eps=1e-5, frames=4, video=True,
-        unused=r"(decoder|mask_token|new_position_ids).*", feature="projected", tokens="hidden",
-        names=("gelsight", "digit", "sensor2", "gelsight_mini", "duragel"),
-    ),
-    Family(
-        "sitr", "SITR", "MIT by its README, without a licence file", "GelSight designs, by calibration images",
-        keymaps.SITR, (*_TIMM_NEEDS, "contrastive_head.weight"),
-        Preparation("subtract", "plain", crop="square",
-                    mean=(-1.2223, -1.8114, -1.7090), std=(11.7932, 12.7956, 13.6452)),
-        prefixes=("base_model.", ""), unused=r"decoder_pred\..*", eps=1e-5, feature="unit",
-    ),
-    Family(
-        "dinov3", "DINOv3 (Hugging Face)", "DINOv3 licence", _IMAGES,
-        keymaps.HF_DINOV3, ("embeddings.patch_embeddings.weight", "embeddings.cls_token", "layer.0.norm1.weight"),
-        prefixes=("dinov3_vit.", ""), **_DINOV3,
-    ),
-    Family(
-        "dinov3", "DINOv3 (timm's or its authors' layout)", "DINOv3 licence", _IMAGES,
-        keymaps.DINOV3, ("patch_embed.proj.weight", "cls_token", "register_tokens", "blocks.0.ls1.gamma"), **_DINOV3,
-    ),
-    Family(
-        "siglip", "SigLIP or SigLIP 2 (vision tower of Hugging Face)", _APACHE, _IMAGES,
-        keymaps.SIGLIP, tuple(f"embeddings.{name}" for name in (
-            "patch_embedding.weight", "patch_embedding.bias", "position_embedding.weight")),
-        Preparation(filter="bicubic", mean=(0.5,) * 3, std=(0.5,) * 3), lacks=("embeddings.class_embedding",),
-        prefixes=("vision_model.", "model.vision_model.", ""), resample="bicubic", feature="pooled",
-        activation="gelu_pytorch_tanh",
-    ),
-    Family(
-        "vit", "DeiT III (timm's layout)", _APACHE, _IMAGES,
-        keymaps.TIMM, (*_TIMM_NEEDS, "blocks.0.ls1.gamma", "head.weight"), _PHOTO, lacks=("register_tokens",),
-        unused=_PARTS, resample="antialias", bare_class=True,
-    ),
-    Family(
-        "dinov2", "DINOv2 (Hugging Face)", _APACHE, _IMAGES,
-        keymaps.HF_DINOV2, (*_HF_NEEDS, "encoder.layer.0.layer_scale1.lambda1"), _PHOTO,
-        prefixes=("dinov2.", "dinov2_with_registers.", ""), resample="bicubic", **_DINOV2,
-    ),
-    Family(
-        "dinov2", "DINOv2 with registers (timm's layout)", _APACHE, _IMAGES,
-        keymaps.TIMM, (*_TIMM_NEEDS, "blocks.0.ls1.gamma", "register_tokens"), _PHOTO, beside="reg_token",
-        renamed=(("^reg_token$", "register_tokens"),), bare_class=True, **_DINOV2,
-    ),
-    Family(
-        "dinov2", "DINOv2 (its authors' layout)", _APACHE, _IMAGES,
-        keymaps.TIMM, (*_TIMM_NEEDS, "blocks.0.ls1.gamma"), _PHOTO, resample="shifted", **_DINOV2,
-    ),
-    Family(
-        "vit_mae", "ViT-MAE (Hugging Face)", _NON_COMMERCIAL, _IMAGES,
-        keymaps.HF_VIT, (*_HF_NEEDS, "encoder.layer.0.layernorm_before.weight"), _PHOTO,
-        beside="decoder.mask_token", **_HF_VIT,
-    ),
-    Family(
-        "vit", "ViT or DeiT (Hugging Face)", _APACHE, _IMAGES,
-        keymaps.HF_VIT, (*_HF_NEEDS, "encoder.layer.0.layernorm_before.weight"), _PHOTO, **_HF_VIT,
-    ),
-    Family(
-        "t3", "T3", "MIT", "one file for each sensor",
-        keymaps.T3, (*_TIMM_NEEDS, "trunk.norm.weight"), replace(_PHOTO, filter="bilinear"), resample="bicubic",
-    ),
-    Family(
-        "vit", "ViT, DeiT or MAE (timm's layout)", "that of the weights (DeiT: Apache-2.0, MAE: CC BY-NC 4.0)", _IMAGES,
-        keymaps.TIMM, (*_TIMM_NEEDS, "norm.weight"), _PHOTO, unused=_PARTS, resample="antialias",
-    ),
+from anytouch_jax.nn.vit import Vit, VitConfig
+from anytouch_jax.weights import load
+from anytouch_jax.weights.convert import check_arrays, file_shapes, fill, refuse_unknown
+from anytouch_jax.weights.keymaps import (
+    DECODER,
+    VISION_HEADS,
+    Entry,
+    Shape,
+    Weights,
+    each_layer,
+    find_depth,
 )
-# fmt: on
+from anytouch_jax.weights.safetensors import WeightsError
+from anytouch_jax.weights.tree import flatten
+from anytouch_jax.zoo.preprocessing import stated_steps
+from anytouch_jax.zoo.table import ALIASES as ALIASES
+from anytouch_jax.zoo.table import FAMILIES as FAMILIES
+from anytouch_jax.zoo.table import IMAGES, SHARED, TIMM_NEEDS, UNREAD, Family, Preparation, Size
+
+_HEADS = {192: 3, 1152: 16} | VISION_HEADS
 
 
 @dataclass(frozen=True)
@@ -236,31 +51,13 @@ class FamilyModel:
     params: dict[str, np.ndarray] = field(repr=False)
 
 
-_UNREAD = {  # an array of a relative of these families: why it is not read
-    "dist_token": "is a distilled DeiT, which has a second class token; give a DeiT without distillation",
-    "fc_norm.weight": "classifies by the mean of its patches (fc_norm) and has no norm of its tokens, as a fine-tuned "
-    "MAE does; give weights from before the fine-tuning",
-    **dict.fromkeys(
-        (
-            "blocks.0.mlp.w1.weight",
-            "blocks.0.mlp.w12.weight",
-            "blocks.0.mlp.fc1_g.weight",
-            "layer.0.mlp.gate_proj.weight",
-            "model.layer.0.mlp.gate_proj.weight",
-            "encoder.layer.0.mlp.weights_in.weight",
-        ),
-        "has gated MLPs (SwiGLU), as the largest DINOv2 and DINOv3 have; give a smaller one",
-    ),
-}
-
-
 def _refuse_relatives(path: Path, weights: Weights) -> None:
     """Raise WeightsError for the file of a ViT whose form is not computed here."""
     timm = weights.get("patch_embed.proj.weight")
     patch = "vision_model.embeddings.patch_embedding.weight"
     reasons = [
-        _UNREAD[key]
-        for key in _UNREAD
+        UNREAD[key]
+        for key in UNREAD
         if key in weights and (key[0] != "f" or "norm.weight" not in weights)
     ]
     if any(key.endswith(patch) and x.ndim == 2 for key, x in weights.items()):
@@ -278,78 +75,100 @@ def _refuse_relatives(path: Path, weights: Weights) -> None:
 def load_family(
     path: Path, *, heads: int | None = None, image_size: Any = None
 ) -> tuple[FamilyModel | None, Weights | None]:
-    """Return the encoder of a family's file or folder, or None, and the arrays that were read.
+    """Read the encoder of another family.
 
-    Raises WeightsError.
+    Args:
+        path: a file or a folder.
+        heads: the number of attention heads, where no file states it.
+        image_size: a side or (height, width), where it is not that of the training.
+
+    Returns:
+        The encoder, None for a file of no family, and the arrays that were read, which need not be
+        read again; None if nothing was read.
+
+    Raises:
+        WeightsError: a file of a family that is damaged, or of a form that is not computed here.
     """
     if not path.exists() or path.suffix.lower() == ".npz" or load.is_run_folder(path):
         return None, None
-    trunks = (
-        (path / "trunk.pth",)
-        if path.is_dir()
-        else (path.parent / "trunk.pth", path.parent.parent / "trunk.pth")
-    )
-    trunk = next((file for file in trunks if file.is_file()), None)
-    sensors = dict[str, Path]()
+    trunk = _find_trunk(path)
+    sensors: dict[str, Path] = {}
     if path.is_dir() and trunk is not None:
-        sensors = {
-            ALIASES.get(file.stem, file.stem): file for file in sorted(path.glob("encoders/*.pth"))
-        }
+        files = sorted(path.glob("encoders/*.pth"))
+        sensors = {ALIASES.get(file.stem, file.stem): file for file in files}
     file = next(iter(sensors.values())) if sensors else load.find_weights_file(path)
     weights = load.read_weights(file)
     _refuse_relatives(file, weights)
-    if not weights.keys() >= {*_TIMM_NEEDS} or weights.keys() & {
-        "norm.weight",
-        "blocks.0.ls1.gamma",
-    }:
+    # An encoder of T3 alone is a ViT of timm that ends before the final norm, which its trunk has.
+    has_end = weights.keys() & {"norm.weight", "blocks.0.ls1.gamma"}
+    if has_end or not weights.keys() >= {*TIMM_NEEDS}:
         if file.name == "trunk.pth":
             raise WeightsError(
                 f"{file} is the trunk of T3 alone; give its folder, or encoders/SENSOR.pth"
             )
-        return read_family(
-            file, weights, _folder(file), heads=heads, image_size=image_size
-        ), weights
+        model = read_family(file, weights, _folder(file), heads=heads, image_size=image_size)
+        return model, weights
     if trunk is None:
         raise WeightsError(
             f"{file} has no final norm; if it is an encoder of T3, put its trunk.pth into its "
             "folder"
         )
-    rest = {f"trunk.{key}": array for key, array in load.read_weights(trunk).items()}
     sensors = sensors or {ALIASES.get(file.stem, file.stem): file}
+    return _read_t3(path, sensors, trunk, {file: weights}, heads, image_size), None
+
+
+def _find_trunk(path: Path) -> Path | None:
+    """Return the trunk.pth of T3 that belongs to a folder or to an encoder's file."""
+    folders = [path] if path.is_dir() else [path.parent, path.parent.parent]
+    for folder in folders:
+        if (folder / "trunk.pth").is_file():
+            return folder / "trunk.pth"
+    return None
+
+
+def _read_t3(
+    path: Path,
+    sensors: Mapping[str, Path],
+    trunk: Path,
+    read: Mapping[Path, Weights],
+    heads: int | None,
+    image_size: Any,
+) -> FamilyModel:
+    """Return T3 for several sensors: an encoder each, stacked by sensor, and one trunk.
+
+    `read` are the arrays of files that were read before.
+    """
+    rest = {f"trunk.{key}": array for key, array in load.read_weights(trunk).items()}
     names = (*sensors, UNIVERSAL)
     models = []
-    for one in sensors.values():
-        content = weights if one == file else load.read_weights(one)
-        whole = {**content, **rest}
-        models.append(
-            read_family(
-                one, whole, _folder(trunk), heads=heads, image_size=image_size, sensors=names
-            )
+    for file in sensors.values():
+        own = read[file] if file in read else load.read_weights(file)
+        folder = _folder(trunk)
+        model = read_family(
+            file, {**own, **rest}, folder, heads=heads, image_size=image_size, sensors=names
         )
+        models.append(model)
     first = models[0]
     if first is None or any(model is None or model.form != first.form for model in models):
         raise WeightsError(
             f"the encoders {', '.join(sensors)} of {path} have different forms; load one file at a "
             "time"
         )
-    several = (
-        []
-        if len(models) == 1
-        else [name for name in first.params if name.split("/")[0] not in SHARED]
-    )
-    params = first.params | {
-        name: np.stack([m.params[name] for m in models if m]) for name in several
-    }
-    return replace(first, params=params), None
+    if len(models) == 1:
+        return first
+    stacked = {}
+    for name in first.params:
+        if name.split("/")[0] not in SHARED:
+            stacked[name] = np.stack([model.params[name] for model in models if model])
+    return replace(first, params=first.params | stacked)
 
 
 def _folder(file: Path) -> dict[str, Any]:
     """Return the config.json beside a file, with what it and a preprocessor_config.json state as
     `stated`.
     """
-    config, theirs = (
-        load.read_settings(file.with_name(f"{name}config.json")) for name in ("", "preprocessor_")
-    )
+    config = load.read_settings(file.with_name("config.json"))
+    theirs = load.read_settings(file.with_name("preprocessor_config.json"))
     return config | {"stated": stated_steps(config, theirs)}
 
 
@@ -381,17 +200,10 @@ def read_family(
     folder = {**folder, **vision} if isinstance(vision, dict) else folder
     try:
         own = _completed(family, own, folder, heads)
-        size = (
-            image_size
-            if image_size is None
-            else (image_size,) * 2
-            if isinstance(image_size, int)
-            else image_size
-        )
+        size = (image_size,) * 2 if isinstance(image_size, int) else image_size
         changes, wanted, ignored = folder.get("stated", ({}, None, []))
-        if (
-            family.sensors != _IMAGES
-        ):  # they have steps of their authors; only the statistics may be others
+        # Encoders of touch have steps of their authors. Only the statistics may be others.
+        if family.sensors != IMAGES:
             changes = {key: x for key, x in changes.items() if key in ("mean", "std")}
             wanted = None
             ignored = []
@@ -465,93 +277,6 @@ def _completed(
     return own
 
 
-def load_start(
-    fresh: dict[str, Any],
-    config: Config,
-    *,
-    init: str | Path | None = None,
-    clip: str | Path | None = None,
-) -> load.Start:
-    """Return the first parameters of a run, as `load.load_init`, where `init` may also be an
-    encoder of photographs.
-
-    DINOv2, ViT-MAE, ViT and DeiT start the touch encoder. CLIP weights do so in stage 1, as `clip`.
-    Raises UserError.
-    """
-    model, weights = (None, None) if init is None else load_family(registry.locate(init))
-    if model is None:
-        towers = any(
-            re.fullmatch(KEYMAPS[name].mark, key)
-            for name in ("clip", "openclip")
-            for key in weights or ()
-        )
-        if towers and clip is None and config.stage == 1:
-            return load.load_init(fresh, config, clip=init)
-        return load.load_init(fresh, config, init=init, clip=clip)
-    start = (
-        load.load_init(fresh, config, clip=clip) if clip is not None else load.Start(fresh, [], ())
-    )
-    touch, notes = touch_of_photographs(model, str(init), config, start.params["touch"])
-    return start._replace(params={**start.params, "touch": touch}, notes=[*start.notes, *notes])
-
-
-def touch_of_photographs(
-    model: FamilyModel, source: str, config: Config, fresh: dict[str, Any]
-) -> tuple[dict[str, Any], list[str]]:
-    """Return a touch encoder that gives a still the tokens of a ViT of photographs, and sentences
-    to log.
-
-    The patch kernel is divided among the frames. Its bias goes into the resized positions, and
-    layer scales into the layers before them. Raises UserError for another family, and for a network
-    of another form.
-    """
-    form = model.form
-    ours = config.model
-    has_tokens = {"position", "class_token"} <= model.params.keys() and not form.tanh
-    if model.family.sensors != _IMAGES or form.model.touch.depth == 0 or not has_tokens:
-        raise UserError(
-            f"{source} is an encoder of {model.family.title}; a run starts from weights of "
-            "AnyTouch, DINOv2, ViT-MAE, "
-            "ViT, DeiT or CLIP"
-        )
-    kept = {
-        name: getattr(ours, name)
-        for name in ("embed", "frames", "sensor_tokens", "patch_encoder", "decoder")
-    }
-    theirs = replace(
-        form.model, **kept, decoder_norm_eps=ours.decoder_norm_eps, pre_norm=form.pre_norm
-    )
-    convert.check_form(Path(source), theirs, config)
-    if ours.activation != "gelu":
-        raise UserError(
-            f"{source} was trained with gelu; leave out --model.activation {ours.activation}"
-        )
-    own = {
-        name: array
-        for name, array in model.params.items()
-        if name.startswith(("blocks/", "post_norm/", "pre_"))
-    }
-    for scale, branch in (("scale1", "attention/out"), ("scale2", "mlp/down")):
-        if (factor := own.pop(f"blocks/{scale}/scale", None)) is not None:
-            own[f"blocks/{branch}/kernel"] = own[f"blocks/{branch}/kernel"] * factor[:, None]
-            own[f"blocks/{branch}/bias"] = own[f"blocks/{branch}/bias"] * factor
-    position = convert.resize_position(model.params["position"], ours.patches + 1)
-    position[1:] += model.params.get("patch/bias", np.float32(0))
-    shape = fresh["patch"]["kernel"].shape
-    own["patch/kernel"] = np.broadcast_to(model.params["patch/kernel"][0], shape) / np.float32(
-        shape[-3]
-    )
-    touch = {name: fresh[name] for name in ("sensor_tokens", "projection")}
-    touch |= nest({**own, "position": position, "class_token": model.params["class_token"]})
-    notes = [
-        f"{source} gives the touch encoder; its projection, the sensor tokens and the decoder "
-        "start untrained"
-    ]
-    if form.registers:
-        notes.append(f"the {form.registers} register tokens of {source} are left out")
-    return touch, notes
-
-
 def entries_of(family: Family, form: VitConfig) -> tuple[list[Entry], dict[str, Shape]]:
     """Return the arrays of a file of this form, and the shapes of our parameters."""
     shapes = {name: tuple(leaf.shape) for name, leaf in flatten(Part(Vit, form).abstract()).items()}
@@ -621,7 +346,7 @@ def form_of(
         patch,
         outputs or width,
         touch,
-        keymaps.DECODER,
+        DECODER,
         frames=frames,
         sensors=sensors or (UNIVERSAL,),
         sensor_tokens=own[1],
@@ -691,139 +416,3 @@ def _heads(width: int, heads: int | None, folder: Mapping[str, Any]) -> int:
             f"a width of {width} cannot have {str(count)[:40]} heads; correct the number of heads"
         )
     return count
-
-
-# Preprocessing that timm (config.json) or Hugging Face (preprocessor_config.json) states in a file
-# next to weights.
-_FILTERS = ("nearest", "lanczos", "bilinear", "bicubic", "box", "hamming")  # by Pillow's numbers
-_HF_STEPS = {"do_resize", "do_center_crop", "do_rescale", "do_normalize", "do_convert_rgb"}
-_HF_VALUES = {
-    "size",
-    "crop_size",
-    "resample",
-    "rescale_factor",
-    "image_mean",
-    "image_std",
-    "image_processor_type",
-    "feature_extractor_type",
-    "processor_class",
-    "_valid_processor_keys",
-    "data_format",
-    "input_data_format",
-    "return_tensors",
-    "device",
-    "default_to_square",
-    "disable_grouping",
-}
-_TIMM = ("mean", "std", "interpolation", "crop_pct", "crop_mode", "input_size")
-
-
-def stated_steps(
-    config: Mapping[str, Any], theirs: Mapping[str, Any]
-) -> tuple[dict[str, Any], Any, list[str]]:
-    """Return changes of a Preparation, the (height, width) of the input or None, and what of both
-    files is ignored.
-    """
-    if theirs:
-        return _hugging_face(theirs)
-    timm = config.get("pretrained_cfg", config if "architecture" in config else None)
-    if isinstance(timm, Mapping) and timm.keys() & {*_TIMM}:
-        return _timm(timm)
-    return ({}, None, [])
-
-
-def _timm(stated: Mapping[str, Any]) -> tuple[dict[str, Any], Any, list[str]]:
-    changes: dict[str, Any] = {key: stated[key] for key in ("mean", "std") if key in stated}
-    size = _size(list(stated.get("input_size", ()))[1:])
-    ignored = list[str]()
-    _add_filter(changes, stated.get("interpolation"), ignored)
-    share = stated.get("crop_pct", 1.0)
-    mode = stated.get("crop_mode", "center")
-    if size is not None and isinstance(share, int | float) and 0 < share <= 1:
-        if mode == "center":
-            changes |= {"crop": "centre", "shorter": int(max(size) / share)}
-        elif mode == "squash" and share == 1:
-            changes |= {"crop": "none", "shorter": None}
-        else:
-            ignored.append(f"crop_mode {mode} with crop_pct {share}")
-    elif "crop_pct" in stated:
-        ignored.append(f"crop_pct {share}")
-    return changes, size, ignored
-
-
-def _hugging_face(stated: Mapping[str, Any]) -> tuple[dict[str, Any], Any, list[str]]:
-    changes: dict[str, Any] = {}
-    known = {*_HF_STEPS, *_HF_VALUES}
-    ignored = [
-        f"{name} {str(value)[:40]}"
-        for name, value in stated.items()
-        if name not in known and value not in (None, False)
-    ]
-    does = {
-        name: stated.get(name, name != "do_center_crop" or "crop_size" in stated)
-        for name in _HF_STEPS
-    }
-    _add_filter(changes, stated.get("resample"), ignored)
-    resized = stated.get("size")
-    cropped = _size(stated.get("crop_size"))
-    edge = resized.get("shortest_edge") if isinstance(resized, Mapping) else None
-    if edge is None and type(resized) is int and does["do_center_crop"]:
-        edge = resized
-    whole = None if edge is not None else _size(resized)
-    size = cropped if does["do_center_crop"] and cropped else whole
-    if not does["do_resize"]:
-        ignored.append("do_resize false")
-    elif does["do_center_crop"] and cropped and type(edge) is int:
-        changes |= {"crop": "centre", "shorter": edge}
-    elif whole is not None and (not does["do_center_crop"] or cropped in (None, whole)):
-        changes |= {"crop": "none", "shorter": None}
-    elif resized is not None:
-        ignored.append(f"size {resized} with crop_size {stated.get('crop_size')}")
-    scale = 1.0  # of the values 0 to 1 that are normalised here
-    if not does["do_rescale"]:
-        scale = 255.0
-    elif isinstance(factor := stated.get("rescale_factor", 1 / 255), int | float) and factor > 0:
-        scale = 255.0 * factor
-    else:
-        ignored.append(f"rescale_factor {str(factor)[:40]}")
-    given = {"mean": stated.get("image_mean"), "std": stated.get("image_std")}
-    if not does["do_normalize"]:
-        given = {"mean": [0.0] * 3, "std": [1.0] * 3}
-    if abs(scale - 1) > 1e-6 and all(_numbers(value) for value in given.values()):
-        given = {
-            name: [number / scale for number in value]
-            for name, value in given.items()
-            if value is not None
-        }
-    return (
-        changes | {name: value for name, value in given.items() if value is not None},
-        size,
-        ignored,
-    )
-
-
-def _add_filter(changes: dict[str, Any], stated: Any, ignored: list[str]) -> None:
-    name = _FILTERS[stated] if type(stated) is int and 0 <= stated < len(_FILTERS) else stated
-    if name in _FILTERS:
-        changes["filter"] = name
-    elif name not in (None, "random"):  # timm's training draws one
-        ignored.append(f"interpolation {str(name)[:40]}")
-
-
-def _numbers(value: Any) -> bool:
-    return isinstance(value, list) and all(isinstance(one, int | float) for one in value)
-
-
-def _size(value: Any) -> tuple[int, int] | None:
-    """Return (height, width) of a side, a list or an object with them; None for anything else."""
-    if isinstance(value, Mapping):
-        value = [value.get("height"), value.get("width")]
-    sides = [value] * 2 if type(value) is int else value
-    fits = (
-        isinstance(sides, list)
-        and len(sides) == 2
-        and all(type(side) is int and side > 0 for side in sides)
-    )
-    if fits:
-        return (sides[0], sides[1])
-    return None

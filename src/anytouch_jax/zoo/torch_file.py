@@ -287,10 +287,14 @@ _INERT |= {
 }
 _INERT |= {"builtins.dict", "__builtin__.dict"}
 # Operations that only make data. BYTEARRAY8 is left out: it allocates whatever size it is given.
-_DATA = """PROTO FRAME STOP MARK POP POP_MARK DUP NONE NEWTRUE NEWFALSE INT BININT BININT1 BININT2 LONG LONG1 LONG4
-    FLOAT BINFLOAT UNICODE BINUNICODE SHORT_BINUNICODE BINUNICODE8 STRING BINSTRING SHORT_BINSTRING BINBYTES
-    SHORT_BINBYTES BINBYTES8 EMPTY_DICT EMPTY_LIST EMPTY_TUPLE EMPTY_SET TUPLE TUPLE1 TUPLE2 TUPLE3 LIST APPEND APPENDS
-    PUT BINPUT LONG_BINPUT MEMOIZE GET BINGET LONG_BINGET GLOBAL STACK_GLOBAL BINPERSID"""
+_DATA = """
+    PROTO FRAME STOP MARK POP POP_MARK DUP
+    NONE NEWTRUE NEWFALSE INT BININT BININT1 BININT2 LONG LONG1 LONG4 FLOAT BINFLOAT
+    UNICODE BINUNICODE SHORT_BINUNICODE BINUNICODE8 STRING BINSTRING SHORT_BINSTRING
+    BINBYTES SHORT_BINBYTES BINBYTES8
+    EMPTY_DICT EMPTY_LIST EMPTY_TUPLE EMPTY_SET TUPLE TUPLE1 TUPLE2 TUPLE3 LIST APPEND APPENDS
+    PUT BINPUT LONG_BINPUT MEMOIZE GET BINGET LONG_BINGET GLOBAL STACK_GLOBAL BINPERSID
+"""
 # Operations replaced in `_Unpickler`. Hashing a tuple that is nested 150,000 times would end the
 # process.
 _GUARDED = "DICT SETITEM SETITEMS ADDITEMS REDUCE NEWOBJ BUILD INST"
@@ -310,8 +314,7 @@ def _code(name: str) -> int:
 def _refused(name: str) -> WeightsError:
     return WeightsError(
         f"the pickle wants {name!r}, which is neither a tensor nor a plain container; it was "
-        "refused and nothing was "
-        "run: save the weights as a plain state_dict or as safetensors"
+        "refused and nothing was run: save the weights as a plain state_dict or as safetensors"
     )
 
 

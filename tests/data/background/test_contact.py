@@ -18,9 +18,7 @@ def gel(depth=0.0, seed=0, shift=0.0):
 
 @pytest.fixture
 def world(tmp_path):
-    """world(rows): a manifest of rows (name, picture, cells); a `background_path` of "bg.png" is
-    the untouched gel.
-    """
+    """world(rows): a manifest of rows (name, picture, cells); "bg.png" is the untouched gel."""
 
     def build(rows, **more):
         cv2.imwrite(str(tmp_path / "bg.png"), gel()[..., ::-1])
@@ -107,9 +105,7 @@ def test_background_rows_of_a_unit_are_its_untouched_gel(world):
 
 
 def film(name, share, shape="ball", look="dotted", **cells):
-    """Rows of a film for `world`, a gel pressed for a share of 20 frames, and whether each is
-    pressed.
-    """
+    """Rows of a gel pressed for a share of 20 frames for `world`, and whether each is pressed."""
     pictures, contact = press_film(look, share, shape, 20)
     return [
         (f"{name}{k}.png", one, {"sequence": name, **cells}) for k, one in enumerate(pictures)

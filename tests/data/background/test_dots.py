@@ -1,6 +1,4 @@
-"""Motion of dots: known shifts come back, with true deviations, and colours of a press do not
-disturb them.
-"""
+"""Motion of dots: known shifts come back with true deviations, also under a press."""
 
 import cv2
 import numpy as np
@@ -14,9 +12,7 @@ RADIUS = 5
 
 
 def gel_with_dots(motion=lambda x, y: (0 * x, 0 * y), *, ink=30, dots=True, noise=0.0, press=0.0):
-    """A gel u8 (240, 320, 3) whose dots have moved by `motion` pixels, with the colours of a
-    press.
-    """
+    """A gel u8 (240, 320, 3) whose dots have moved by `motion` pixels, under a press."""
     y, x = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(np.float32)
     picture = np.stack([110 + 0.2 * x, 130 - 0.1 * y, 140 - 0.1 * x], -1)
     away = np.hypot(x - 170, y - 120) / 40

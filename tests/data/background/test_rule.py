@@ -32,17 +32,17 @@ def distance(picture, look="coloured", tint=0):
 def test_the_median_of_pressed_frames_is_the_untouched_gel(look):
     frames = presses(30, look)
     free = UntouchedGel(gel_frame(look, 0))
-    assert free.score(gels.untouched_gel(frames)) < 3 < 6 < min(map(free.score, frames[5:25]))
-    assert np.array_equal(gels.untouched_gel(iter(frames)), gels.untouched_gel(np.stack(frames)))
-    refused("too few", gels.untouched_gel, frames[:2])
-    refused("2 sizes", gels.untouched_gel, [*frames, frames[0][:50]])
+    assert free.score(gels.estimate_background(frames)) < 3 < 6 < min(map(free.score, frames[5:25]))
+    assert np.array_equal(
+        gels.estimate_background(iter(frames)), gels.estimate_background(np.stack(frames))
+    )
+    refused("too few", gels.estimate_background, frames[:2])
+    refused("2 sizes", gels.estimate_background, [*frames, frames[0][:50]])
 
 
 @pytest.fixture
 def world(tmp_path):
-    """world([(frames, cells)]): a manifest of frames with equal cells; "gel.png" is a stored
-    picture, all grey.
-    """
+    """world([(frames, cells)]): frames with equal cells; "gel.png" is a stored picture, grey."""
 
     def build(*groups):
         cv2.imwrite(str(tmp_path / "gel.png"), np.full((120, 160, 3), 90, np.uint8))
@@ -140,6 +140,55 @@ def test_the_same_unit_gets_the_picture_of_a_head_and_another_one_warning(world)
     # a press covers the smaller part of a picture
     for frame in presses(5):
         assert gels.same_unit(known, frame)[1] == ""
+
+
+def other_pattern(gel: np.ndarray) -> np.ndarray:
+    """A gel of the same tint with a stain that covers a twentieth of it."""
+    stained = gel.copy()
+    stained[20:50, 30:60] = np.minimum(stained[20:50, 30:60].astype(int) + 45, 255)
+    return stained
+
+
+def test_the_untouched_gel_of_another_unit_of_one_tint_is_not_taken_for_a_press(world):
+    """Two GelSight Minis of two labs differ by a contact score of 8, and hardly in tint."""
+    known = {"digit a": gel_frame("coloured", 0)}
+    own = other_pattern(known["digit a"])
+    assert UntouchedGel(known["digit a"]).score(own) > 6.5
+    assert gels.same_unit(known, own)[1] == ""  # it may be a press
+    assert "by a contact score of" in gels.same_unit(known, own, untouched=True)[1]
+    assert gels.same_unit(known, gel_frame("coloured", 0, seed=3), untouched=True)[1] == ""
+    table = world(
+        ([own], {"unit": "b", "split": "background"}),
+        ([other_pattern(frame) for frame in presses(6)], {"unit": "b"}),
+        (presses(6), {"unit": "a"}),
+    )
+    said: list[str] = []
+    rule = gels.UnitGels(table, known, said.append)
+    assert (rule(1) == own).all()
+    assert len(said) == 1 and "from every unit that the head or index was fitted with" in said[0]
+    # the median of another one may hold a press, so its tint alone counts
+    assert rule(7) is known["digit a"] and len(said) == 1
+
+
+def test_few_frames_get_the_nearest_picture_and_one_true_line(world):
+    """A deep press alone changes the tint as much as another unit does."""
+    gel = gel_frame("coloured", 0)
+    known = {"digit a": gel, "digit b": np.full_like(gel, 30)}
+    pressed = np.clip(gel.astype(int) + 9, 0, 255).astype(np.uint8)
+    same = gels.recognise(known, gel, is_background=False, of="the index was made with")
+    assert same == (gel, "the picture that the index was made with", "")
+    found = gels.recognise(known, pressed, is_background=False, of="the index was made with")
+    assert found.picture is gel and not found.warning
+    assert found.what.startswith("the nearest picture that the index was made with. So few frames")
+    sure = gels.recognise(known, pressed, is_background=True)
+    assert sure.picture is None and "in tint, by 9 grey levels" in sure.warning
+    small = np.zeros((160, 120, 3), np.uint8)
+    assert gels.recognise(known, small, is_background=False) == (None, "", "")
+    # rows that had no untouched gel, and so were left out
+    said: list[str] = []
+    rule = gels.UnitGels(world(([pressed] * 2, {"unit": "a"})), {"digit a": gel}, said.append)
+    assert rule(0) is gel and said == []
+    assert "the nearest picture that the head was fitted with" in rule.report(np.arange(2))
 
 
 @pytest.mark.parametrize(("look", "share"), list(zip(LOOKS, (0.0, 0.4, 0.6), strict=True)))

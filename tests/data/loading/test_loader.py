@@ -245,9 +245,7 @@ def test_what_has_no_tower_is_not_read(make, settings):
 
 
 def test_captions_are_padded_to_the_longest_in_eights_and_never_beyond_the_tower(make, settings):
-    """Positions behind the end token of every caption are work for nothing; a long caption keeps
-    its end token.
-    """
+    """Positions behind all end tokens are work for nothing. A long caption keeps its end token."""
     for words, length in ((["one"], 8), (["one two three four five six seven eight"], 12)):
         manifest = make([{"text": text} for text in words * 8])
         loader = Loader(manifest, settings(2))  # its tower has 12 positions
@@ -438,9 +436,7 @@ def test_batches_that_groups_or_processes_cannot_share_are_refused(make, setting
 
 
 def _parts(batch):
-    """Arrays of a batch, pictures as the colour of one pixel: what does not depend on versions of
-    the libraries.
-    """
+    """Arrays of a batch, pictures as the colour of one pixel: the same with any OpenCV."""
     if batch is None:
         return
     for name, part in batch._asdict().items():

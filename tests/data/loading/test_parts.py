@@ -15,9 +15,7 @@ from tests.support.tiny_models import touch_model
 
 
 def test_64_hosts_share_a_corpus():
-    """640 shards of uneven size: each host reads its tenth of a hundredth, and an epoch draws each
-    row once.
-    """
+    """Shards of uneven size: each host reads its own, and an epoch draws each row once."""
     rng = np.random.default_rng(0)
     shard = rng.permutation(np.repeat(np.arange(640), rng.integers(20, 40, 640)))
     sampler = PartSampler(shard, 256, 64, 7, 1)

@@ -144,8 +144,10 @@ SIZE = 4
 
 
 def world():
-    """Eight recordings of six frames: every third without caption, every second without photograph;
-    the first two of four objects were felt by two sensors at the same places.
+    """Eight recordings of six frames.
+
+    Every third has no caption, every second no image. The first two of four objects were felt by
+    two sensors at the same places.
     """
     rows = []
     for i in range(8):

@@ -17,7 +17,9 @@ HEAD = "path,sensor,sequence,frame_index,split"
 
 
 GOOD = f"{HEAD},stride,touch,commercial,label.slip,label.name,other\n" + (
-    'a.png,digit,s,0,train,2,,1,0,x,7\nb.png,digit,s,2,train,2,t,0,1,"y, z",\nc.png,gelslim,r,5,test,,t,,,,q\n'
+    "a.png,digit,s,0,train,2,,1,0,x,7\n"
+    'b.png,digit,s,2,train,2,t,0,1,"y, z",\n'
+    "c.png,gelslim,r,5,test,,t,,,,q\n"
 )
 
 
@@ -199,7 +201,8 @@ def test_resolve_keeps_inside_the_folder(tmp_path):
 
 
 def test_sensor_rows(tmp_path):
-    text = f"{HEAD}\na,digit,s,0,train\nb,tac3d,s,1,train\nc,newfinger,s,2,test\nd,allsight,s,3,train\n"
+    rows = "a,digit,s,0,train\nb,tac3d,s,1,train\nc,newfinger,s,2,test\nd,allsight,s,3,train\n"
+    text = f"{HEAD}\n{rows}"
     got = m.read(_file(tmp_path, text))
     model = preset("tiny").model
     refused(r"line 4 of .*manifest\.csv.*unknown sensor 'newfinger'", m.sensor_rows, got, model)
@@ -318,7 +321,7 @@ def test_an_error_in_a_csv_names_the_line_as_an_editor_counts_it(tmp_path):
 
 
 def test_labels_of_a_csv_keep_what_they_say(tmp_path):
-    head = "path,sensor,sequence,frame_index,split,label.object,label.force,label.stable,label.word,label.serial"
+    head = f"{HEAD},label.object,label.force,label.stable,label.word,label.serial"
     rows = [
         "a.png,digit,s,0,train,001, 1.5 ,True,True,0x1A",
         "b.png,digit,s,1,train,007, ,false,maybe,0x10",

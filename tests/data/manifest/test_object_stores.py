@@ -1,6 +1,4 @@
-"""Object stores that answer over HTTP: a corpus in S3 and on the Hugging Face hub, both served
-here.
-"""
+"""Object stores that answer over HTTP: S3 and the Hugging Face hub, both served here."""
 
 import hashlib
 import json

@@ -114,7 +114,10 @@ def test_an_edited_manifest_is_not_replaced_without_keep(tmp_path, read, edited,
     out = edited(ending)
     before = out.read_bytes()
     options = IndexOptions(sensor="digit", val=0, test=0)
-    says = rf"hand{ending} has other values of split \(3 rows\), label.material, which index does not write: .*--keep"
+    says = (
+        rf"hand{ending} has other values of split \(3 rows\), label.material, which index does not "
+        "write: .*--keep"
+    )
     refused(says, index, "recordings", tmp_path, out, options=options)
     assert out.read_bytes() == before
     fill(tmp_path, ["mug/3.png", "mug/more/0.png", "cup/0.png"])

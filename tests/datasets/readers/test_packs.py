@@ -9,7 +9,10 @@ from anytouch_jax.datasets.readers import index
 
 def test_real_touch_is_checked_and_rewritten(tmp_path, read):
     fill(tmp_path, ["a/0.png", "a/1.png", "a/bg.png"])
-    head = "path,sensor,sequence,frame_index,split,dataset,license,commercial,background_path,image_path,label.slip\n"
+    head = (
+        "path,sensor,sequence,frame_index,split,dataset,license,commercial,background_path,"
+        "image_path,label.slip\n"
+    )
     lines = [f"a/{i}.png,digit,a,{i},train,x,MIT,1,a/bg.png,a/lost.png,{i}\n" for i in range(3)]
     (tmp_path / "manifest.csv").write_text(head + "".join(lines))
     table = read("real_touch")

@@ -29,9 +29,9 @@ from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.live.page import live as live_module
 from anytouch_jax.live.page import server
+from anytouch_jax.live.page.feature_map import FeatureMap
 from anytouch_jax.live.page.live import Live
-from anytouch_jax.live.page.tables import FeatureMap
-from anytouch_jax.live.page.teach import SCORE, LiveRecorder
+from anytouch_jax.live.page.recorder import SCORE, LiveRecorder
 
 PAGE = {"X-Anytouch": "1"}
 # picture, contact score and features
@@ -117,8 +117,9 @@ def test_a_film_in_the_place_of_a_camera(encoder, film, tmp_path):
             == decode(table.file(row, "background_path")).shape
             == (48, 48, 3)
         )
-    # nothing hidden
-    assert sorted(path.name[0] for path in (tmp_path / "recorded").iterdir()) == ["2", "2", "m"]
+    # nothing hidden but the lock
+    names = sorted(path.name for path in (tmp_path / "recorded").iterdir())
+    assert names[0] == ".manifest.lock" and [name[0] for name in names[1:]] == ["2", "2", "m"]
 
 
 def test_live_touch_is_measured(encoder, tmp_path, monkeypatch):
@@ -144,7 +145,7 @@ def test_live_touch_is_measured(encoder, tmp_path, monkeypatch):
 
     try:
         free, _ = until("depth", lambda about: about["frame"] > 3)
-        live.capture_background()
+        live.frames.capture_background()
         camera.shape = "ball"
         for layer, shape in (("depth", (360, 480, 3)), ("surface", (54, 72, 3))):
             pressed, picture = until(layer, lambda about: about["fields"]["area"] > 0)
@@ -152,13 +153,13 @@ def test_live_touch_is_measured(encoder, tmp_path, monkeypatch):
                 picture.shape == shape
                 and pressed["fields"]["force"][2] > 0.1 > free["fields"]["force"][2]
             )
-            assert {"contact", "force, N", "depth, mm", "slip"} == set(pressed["curves"])
+            assert {"contact", "force, N", "depth, mm", "slip, %"} == set(pressed["curves"])
         # no frame is read in one way and measured in another
         for rotate in (90, 0) * 40:
-            live.orient(rotate, "none")
-            live.capture_background()
+            live.frames.orient(rotate, "none")
+            live.frames.capture_background()
             time.sleep(0.003)
-        live.orient(90, "none")  # another shape than the sensor's: it is said
+        live.frames.orient(90, "none")  # another shape than the sensor's: it is said
         until("depth", lambda about: any("height" in fault for fault in about["fields"]["faults"]))
     finally:
         live.stop()
@@ -232,7 +233,7 @@ def test_frames_before_a_full_disk_are_kept(tmp_path, monkeypatch):
     assert (
         "No space left" in recorder.state()["done"] and "first 2 frames" in recorder.state()["done"]
     )
-    assert len(list(tmp_path.glob("*_cup/*.png"))) == 2 and not list(tmp_path.glob(".*"))
+    assert len(list(tmp_path.glob("*_cup/*.png"))) == 2 and not list(tmp_path.glob(".*_cup"))
 
 
 def test_a_recording_that_fails_keeps_what_there_was(tmp_path):

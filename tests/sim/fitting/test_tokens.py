@@ -2,6 +2,7 @@
 are not saved.
 """
 
+import signal
 from itertools import count
 from types import SimpleNamespace
 
@@ -15,10 +16,10 @@ from anytouch_jax.config import to_json
 from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.nn.functional import build
 from anytouch_jax.sim.endless import SimulatedTouches
-from anytouch_jax.sim.fitting import task, tokens
-from anytouch_jax.sim.fitting.touches import COUNT
+from anytouch_jax.sim.fitting import comparison, contrast, tokens
 from anytouch_jax.sim.sensing.own import OwnSensor, write_sensor
 from anytouch_jax.sim.sensing.sensors import SENSORS, look
+from anytouch_jax.train import pace
 from anytouch_jax.weights import checkpoint
 from anytouch_jax.weights.tree import flatten
 
@@ -26,11 +27,17 @@ from anytouch_jax.weights.tree import flatten
 def felt(key, world, *, size):
     """Touches of random patterns. Your sensor shows their negative."""
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
-    seen = rng.integers(80, 176, (COUNT, 1, 1, 4, 4, 3)).repeat(size // 4, 3).repeat(size // 4, 4)
+    seen = (
+        rng.integers(80, 176, (contrast.COUNT, 1, 1, 4, 4, 3))
+        .repeat(size // 4, 3)
+        .repeat(size // 4, 4)
+    )
     clip = np.concatenate([seen, 255 - seen], 1).astype(np.uint8)
-    sensor = np.stack([1 + np.arange(COUNT) % 2, np.zeros(COUNT, int)], 1).astype(np.int32)
-    none = np.zeros(COUNT, np.int32)
-    thing = np.arange(COUNT, dtype=np.int32)
+    sensor = np.stack([1 + np.arange(contrast.COUNT) % 2, np.zeros(contrast.COUNT, int)], 1).astype(
+        np.int32
+    )
+    none = np.zeros(contrast.COUNT, np.int32)
+    thing = np.arange(contrast.COUNT, dtype=np.int32)
     return SimulatedTouches(
         clip, np.full_like(clip[:, :, 0], 128), sensor, thing, none, None, None, None, None, {}
     )
@@ -39,7 +46,7 @@ def felt(key, world, *, size):
 def found(share, objects=100, first=0):
     """Held-out touches of which a share is found, some of each object."""
     order = (np.arange(200) * 61 + first) % 200
-    return tokens.Found(order < round(200 * share), np.arange(200, dtype=np.int32) % objects)
+    return comparison.Found(order < round(200 * share), np.arange(200, dtype=np.int32) % objects)
 
 
 @pytest.fixture
@@ -59,7 +66,7 @@ def run(tmp_path, monkeypatch):
     monkeypatch.setattr(tokens, "own_world", lambda *_: None)
     ticks = count()
     # a step takes 0.1 s
-    monkeypatch.setattr(tokens, "time", SimpleNamespace(monotonic=lambda: 0.1 * next(ticks)))
+    monkeypatch.setattr(pace, "time", SimpleNamespace(monotonic=lambda: 0.1 * next(ticks)))
     config = run_config(tmp_path / "none.csv").with_settings({"data.background": "subtract"})
     params = build(config.model).init(jax.random.key(0))
     params["touch"]["sensor_tokens"] = params["touch"]["sensor_tokens"] * 20
@@ -75,20 +82,16 @@ def run(tmp_path, monkeypatch):
 
 
 def stopping(monkeypatch, steps):
-    """Let the training be interrupted after some steps."""
-    real = tokens._train
+    """Let Ctrl-C arrive while the batch of a step is made."""
+    real = tokens.felt_batches
 
-    def train(kept, step, *rest):
-        number = count(1)
+    def batches(start, stop, **options):
+        for step, batch, info in real(start, stop, **options):
+            if step == steps - 1:
+                signal.raise_signal(signal.SIGINT)
+            yield step, batch, info
 
-        def counted(*words):
-            if next(number) > steps:
-                raise KeyboardInterrupt
-            return step(*words)
-
-        return real(kept, counted, *rest)
-
-    monkeypatch.setattr(tokens, "_train", train)
+    monkeypatch.setattr(tokens, "felt_batches", batches)
 
 
 @pytest.mark.parametrize("deep", [False, True])
@@ -110,12 +113,12 @@ def test_an_interrupted_training_ends_as_an_undisturbed_one_and_moves_only_what_
     with monkeypatch.context() as stopped:
         stopping(stopped, 18)
         assert app.main(words) == 130
-    state = tmp_path / "out.part.npz"
-    assert state.is_file() and not (tmp_path / "out").exists()
+    state = tmp_path / "out.part"
+    assert state.is_dir() and not (tmp_path / "out").exists()
     scores = iter((found(0.2), found(0.4)) * 2)
-    monkeypatch.setattr(tokens, "_found", lambda *_: next(scores))
+    monkeypatch.setattr(tokens, "found_touches", lambda *_: next(scores))
     assert app.main(words) == 0 and not state.exists()
-    assert "continued after 18 steps of 30" in capsys.readouterr().err
+    assert "continuing from the checkpoint of step 18 of 30" in capsys.readouterr().err
     assert app.main([*words[: -1 - deep], str(tmp_path / "undisturbed"), *["--deep"] * deep]) == 0
     resumed, undisturbed = (
         flatten(checkpoint.load_params(tmp_path / name)[0]) for name in ("out", "undisturbed")
@@ -148,7 +151,7 @@ def test_tokens_are_kept_if_they_are_shown_to_find_more(
     run, mine, tmp_path, monkeypatch, capsys, universal, trained, objects, kept
 ):
     scores = iter((found(universal, objects), found(trained, objects, first=7)))
-    monkeypatch.setattr(tokens, "_found", lambda *_: next(scores))
+    monkeypatch.setattr(tokens, "found_touches", lambda *_: next(scores))
     out = tmp_path / "out"
     words = ["adapt", "--model", str(run), "--sensor", str(mine), "--minutes", "0.01"]
     assert app.main([*words, "--out", str(out), "--deep"]) == 0
@@ -172,14 +175,16 @@ def test_the_interval_is_of_pairs_and_of_objects():
     alike = np.arange(200) % 2 == 0
     few = alike.copy()
     few[1:9:2] = True
-    compared = tokens.compare_found(
-        tokens.Found(alike, np.arange(200)), tokens.Found(few, np.arange(200))
+    compared = comparison.compare_found(
+        comparison.Found(alike, np.arange(200)), comparison.Found(few, np.arange(200))
     )
     assert compared.shown and compared.low > 0, "four touches more, and none less"
     assert (compared.universal, compared.trained, compared.touches) == (0.5, 0.52, 200)
     # The same four touches are of one object, which is drawn or is not.
     objects = np.where(np.arange(200) < 9, 0, np.arange(200))
-    compared = tokens.compare_found(tokens.Found(alike, objects), tokens.Found(few, objects))
+    compared = comparison.compare_found(
+        comparison.Found(alike, objects), comparison.Found(few, objects)
+    )
     assert not compared.shown and compared.low == 0 and compared.objects == 192
     # Without pairs the interval would be as wide as that of two samples: some 10 points.
     assert compared.high - compared.low < 0.08
@@ -187,7 +192,7 @@ def test_the_interval_is_of_pairs_and_of_objects():
 
 def test_training_finds_touches_that_the_universal_tokens_do_not(run, mine, monkeypatch):
     monkeypatch.setattr(tokens, "BATCHES", 2)
-    monkeypatch.setattr(task, "DEEP_RATE", 3e-3)
+    monkeypatch.setattr(contrast, "DEEP_RATE", 3e-3)
     adapted = tokens.adapt_by_simulation(run, mine, minutes=0.25, deep=True)
     compared = adapted.metadata["source"]["compared"]
     assert len(adapted.losses) == 150 and compared["trained"] > compared["universal"]

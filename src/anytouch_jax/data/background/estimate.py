@@ -1,10 +1,11 @@
-"""Pictures of the untouched gel: background images, and estimates of them from the frames of a
-recording.
+"""Estimates of the background image (the untouched gel) from the frames of a recording.
 
 Frames of the untouched gel are alike, and have less structure than frames in which something
 presses. The estimate is the group of alike frames that has less structure than all frames that
 differ from it, however long the press lasts. Where no group stands out, or it shows a light press
 itself, the background cannot be known from the frames.
+
+All lengths are in pixels of a picture with LONG_SIDE pixels on its long side, see `scale_picture`.
 """
 
 from __future__ import annotations
@@ -14,6 +15,8 @@ from itertools import combinations
 
 import cv2
 import numpy as np
+
+from anytouch_jax.data import opencv
 
 LONG_SIDE = 160  # pixels of the long side on which all lengths below are measured
 # widest marker dot, its darkness in grey levels, dots that a marked gel shows
@@ -29,21 +32,23 @@ WIDE = 8  # blur of the gel's slow changes of light
 # grey levels: frames of one state, and frames of two
 ALIKE = 3.0
 DIFFERENT = 6.5
-_AT = (np.arange(FIT, dtype=np.float32) + 0.5) / FIT - 0.5
-# of a plane, by cell
-_TERMS = np.stack([np.ones(FIT * FIT, np.float32), np.tile(_AT, FIT), np.repeat(_AT, FIT)], 1)
-# least excess of structure, as a share of the sum; measured on real and simulated recordings
+# least excess of structure, as a fraction of the sum; measured on real and simulated recordings
 MARGIN = 0.1
+
+_FITTING = 0.6  # fraction of the cells that a change of light is fitted to
+_AT = (np.arange(FIT, dtype=np.float32) + 0.5) / FIT - 0.5
+# The terms 1, x and y of a plane, in each cell.
+_TERMS = np.stack([np.ones(FIT * FIT, np.float32), np.tile(_AT, FIT), np.repeat(_AT, FIT)], 1)
 
 
 def scale_picture(picture: np.ndarray, long_side: int = LONG_SIDE) -> np.ndarray:
     """Scale a picture to `long_side` pixels on its long side."""
+    opencv.set_up()
     height, width = picture.shape[:2]
     shrink = long_side / max(height, width)
     size = max(1, round(width * shrink)), max(1, round(height * shrink))
-    return cv2.resize(
-        picture, size, interpolation=cv2.INTER_AREA if shrink < 1 else cv2.INTER_LINEAR
-    )
+    interpolation = cv2.INTER_AREA if shrink < 1 else cv2.INTER_LINEAR
+    return cv2.resize(picture, size, interpolation=interpolation)
 
 
 def close_dots(picture: np.ndarray) -> np.ndarray:
@@ -57,14 +62,23 @@ def has_dots(picture: np.ndarray) -> bool:
     """Return whether a scaled picture of the untouched gel shows marker dots."""
     depth = cv2.GaussianBlur(cv2.subtract(close_dots(picture), picture).max(2), (0, 0), 1)
     _, _, stats, _ = cv2.connectedComponentsWithStats((depth > DOT_DEPTH).astype(np.uint8))
+    # the first component is the ground
     _, _, width, height, area = stats[1:].T
-    is_round = (area >= 4) & (area <= DOT * DOT) & (width <= 2.5 * height) & (height <= 2.5 * width)
-    return int(np.sum(is_round)) >= FEWEST_DOTS
+    is_dot_sized = (area >= 4) & (area <= DOT * DOT)
+    is_round = (width <= 2.5 * height) & (height <= 2.5 * width)
+    return int(np.sum(is_dot_sized & is_round)) >= FEWEST_DOTS
 
 
 def difference_image(frame: np.ndarray, background: np.ndarray, blur: float = BLUR) -> np.ndarray:
-    """Return the colour difference f32 (h, w) of two pictures u8 (h, w, 3), without light, tint and
-    noise.
+    """Return the colour difference of two pictures, without light, tint and noise.
+
+    Args:
+        frame: u8 (h, w, 3).
+        background: u8 (h, w, 3).
+        blur: Standard deviation of the blur, pixels.
+
+    Returns:
+        f32 (h, w), the largest difference of the three colours, in grey levels.
     """
     change = cv2.subtract(frame, background, dtype=cv2.CV_32F)
     change -= change_of_light(change)
@@ -73,28 +87,29 @@ def difference_image(frame: np.ndarray, background: np.ndarray, blur: float = BL
 
 
 def change_of_light(change: np.ndarray) -> np.ndarray:
-    """Return the change of light f32 (h, w, 3), a plane a colour: lamps drift, and a press covers
-    little.
+    """Return the part of a change f32 (h, w, 3) that lamps make: a plane for each colour.
+
+    Lamps drift, and all of the picture with them. A press covers little of it, so the plane is
+    fitted again and again to those 60 % of the cells that it fits best (least trimmed squares).
     """
     small = cv2.resize(change, (FIT, FIT), interpolation=cv2.INTER_AREA).reshape(-1, 3)
-    most = int(0.6 * len(small))
+    most = int(_FITTING * len(small))
     fits = np.arange(len(small))
     for _ in range(3):
         chosen = _TERMS[fits]
         plane = np.linalg.solve(chosen.T @ chosen, chosen.T @ small[fits])
-        fits = np.argpartition(np.abs(small - _TERMS @ plane).max(1), most)[:most]
+        residual = np.abs(small - _TERMS @ plane).max(1)
+        fits = np.argpartition(residual, most)[:most]
     height, width = change.shape[:2]
-    y, x = (
-        ((np.arange(size, dtype=np.float32) + 0.5) / size - 0.5)[:, None]
-        for size in (height, width)
-    )
+    y = ((np.arange(height, dtype=np.float32) + 0.5) / height - 0.5)[:, None]
+    x = ((np.arange(width, dtype=np.float32) + 0.5) / width - 0.5)[:, None]
     return np.asarray((plane[0] + y * plane[2])[:, None] + x * plane[1], np.float32)
 
 
 class UntouchedGel:
-    """A picture of the untouched gel u8 (h, w, 3), which scores frames.
+    """A background u8 (h, w, 3), which scores frames.
 
-    Dots are closed only on a gel that has some.
+    Dots are closed only on a gel that has some, because closing takes small contacts away too.
     """
 
     def __init__(self, picture: np.ndarray) -> None:
@@ -115,45 +130,56 @@ class UntouchedGel:
         Raises ValueError as `score`.
         """
         frame = scale_picture(frame)
-        if max(abs(a - b) for a, b in zip(frame.shape, self.picture.shape, strict=True)) > 2:
+        sides = zip(frame.shape, self.picture.shape, strict=True)
+        if max(abs(a - b) for a, b in sides) > 2:
             raise ValueError("its background has other proportions")
         if min(frame.shape[:2]) <= 2 * EDGE:
             raise ValueError("it is too thin a strip")
         if frame.shape != self.picture.shape:
             frame = cv2.resize(frame, self.picture.shape[1::-1])
-        return difference_image(close_dots(frame) if self.has_dots else frame, self._compared)
+        if self.has_dots:
+            frame = close_dots(frame)
+        return difference_image(frame, self._compared)
 
 
 def estimate_untouched_gel(pictures: Sequence[np.ndarray]) -> tuple[UntouchedGel | None, str]:
-    """Return the untouched gel of scaled frames u8 (h, w, 3) of one recording, or None, and the
-    reason.
+    """Return the background of scaled frames u8 (h, w, 3) of one recording, and the reason.
+
+    It is None if the frames do not show it.
     """
     group, reason = free_frames(pictures)
     if group is None:
-        return (None, reason)
-    return (UntouchedGel(_median([pictures[i] for i in group])), "estimated")
+        return None, reason
+    return UntouchedGel(_median([pictures[i] for i in group])), "estimated"
 
 
 def free_frames(pictures: Sequence[np.ndarray]) -> tuple[np.ndarray | None, str]:
-    """Return the numbers of the frames that show the untouched gel, or None, and the reason;
-    `pictures` as above.
+    """Return the numbers of the frames that show the untouched gel, or None and the reason.
+
+    `pictures` are scaled frames u8 (h, w, 3) of one recording.
     """
     reason = ""
+    # Dots are structure, and move with shear. Whether the gel has some is known only once the free
+    # frames are found, so both are tried, and the answer must agree with what was assumed.
     for marked in (False, True):
         frames = [close_dots(picture) for picture in pictures] if marked else list(pictures)
         group, reason = _least_structured_group(frames)
-        if group is not None:
-            if has_dots(_median([pictures[i] for i in group])) == marked:
-                return group, ""
-            reason = "free and pressed gel look alike"
+        if group is None:
+            continue
+        if has_dots(_median([pictures[i] for i in group])) == marked:
+            return group, ""
+        reason = "free and pressed gel look alike"
     return None, reason
 
 
 def median_gel(pictures: Sequence[np.ndarray]) -> UntouchedGel | None:
-    """Return the median of frames of one unit; None if it shows a press, or if all are alike and
-    may be pressed.
+    """Return the median of frames of one sensor instance, if it shows the untouched gel.
+
+    It is None if it shows a press, or if all frames are alike and may be pressed.
     """
-    free = _median(pictures) if len(pictures) else np.zeros(0)
+    if not len(pictures):
+        return None
+    free = _median(pictures)
     others = [picture for picture in pictures if _distance(free, picture) >= DIFFERENT]
     if not others or np.median([_press_of(free, other) for other in others]) >= ALIKE:
         return None
@@ -161,22 +187,25 @@ def median_gel(pictures: Sequence[np.ndarray]) -> UntouchedGel | None:
 
 
 def gel_of_unit(gels: Sequence[UntouchedGel]) -> UntouchedGel | None:
-    """Return the gel that most estimates of one unit agree on; None if fewer than two do, or as
-    many on another.
+    """Return the background that most estimates of one sensor instance agree on.
+
+    It is None if fewer than two do, or as many on another.
     """
     if len(gels) < 2:
         return None
     groups = _alike([gel.score(other.picture) for gel, other in combinations(gels, 2)])
     groups.sort(key=len, reverse=True)
-    centres = [UntouchedGel(_median([gels[i].picture for i in group])) for group in groups]
-    rivals = [
-        gel
-        for gel, group in zip(centres[1:], groups[1:], strict=True)
-        if len(group) == len(groups[0])
-    ]
-    if len(groups[0]) < 2 or any(centres[0].score(rival.picture) >= ALIKE for rival in rivals):
+    first = groups[0]
+    if len(first) < 2:
         return None
-    return centres[0]
+    centre = UntouchedGel(_median([gels[i].picture for i in first]))
+    for group in groups[1:]:
+        if len(group) < len(first):
+            continue
+        rival = UntouchedGel(_median([gels[i].picture for i in group]))
+        if centre.score(rival.picture) >= ALIKE:
+            return None
+    return centre
 
 
 def _median(pictures: Sequence[np.ndarray]) -> np.ndarray:
@@ -184,7 +213,11 @@ def _median(pictures: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def _alike(distances: Sequence[float]) -> list[np.ndarray]:
-    """Return groups of numbers within ALIKE of each other, from condensed distances."""
+    """Return groups of numbers within ALIKE of each other, from condensed distances.
+
+    Complete linkage: all pairs of a group are alike. With single linkage a press that grows slowly
+    would join the free frames.
+    """
     # 0.3 s, which training has no use for
     from scipy.cluster.hierarchy import fcluster, linkage
 
@@ -193,9 +226,8 @@ def _alike(distances: Sequence[float]) -> list[np.ndarray]:
 
 
 def _least_structured_group(frames: list[np.ndarray]) -> tuple[np.ndarray | None, str]:
-    """Return the frame numbers of the group that has less structure than all frames that differ
-    from it.
-    """
+    """Return the numbers of the frames that have less structure than all that differ from them."""
+    # Half the size, and half the blur: a quarter of the time for the many pairs.
     halves = [
         cv2.resize(frame, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for frame in frames
     ]
@@ -208,15 +240,11 @@ def _least_structured_group(frames: list[np.ndarray]) -> tuple[np.ndarray | None
     centres = [_median([frames[i] for i in group]) for group in groups]
     best = None
     best_margin = MARGIN
-    for number, group in enumerate(groups):
+    for group, centre in zip(groups, centres, strict=True):
         if len(group) < 2:
             continue
-        margin = np.inf
-        for other in centres:
-            if _distance(centres[number], other) >= DIFFERENT:
-                margin = min(margin, _excess_structure(centres[number], other))
-                if margin < best_margin:
-                    break
+        margin = _least_excess(centre, centres, best_margin)
+        # infinite if no other group differs from it
         if best_margin <= margin < np.inf:
             best = group
             best_margin = margin
@@ -231,36 +259,60 @@ def _least_structured_group(frames: list[np.ndarray]) -> tuple[np.ndarray | None
     return best, ""
 
 
+def _least_excess(centre: np.ndarray, centres: Sequence[np.ndarray], enough: float) -> float:
+    """Return the least excess of structure over `centre` of all that differ from it.
+
+    The search ends once it is below `enough`, as the group is out then.
+    """
+    margin = np.inf
+    for other in centres:
+        if _distance(centre, other) >= DIFFERENT:
+            margin = min(margin, _excess_structure(centre, other))
+            if margin < enough:
+                break
+    return margin
+
+
 def _distance(frame: np.ndarray, other: np.ndarray, blur: float = BLUR) -> float:
     return contact_score(difference_image(frame, other, blur), round(EDGE * blur / BLUR))
 
 
 def contact_score(difference: np.ndarray, edge: int = EDGE) -> float:
-    """Return the contact score of a difference image (h, w), without its edges."""
+    """Return the contact score of a difference image (h, w), without its edges.
+
+    A percentile, not the maximum: single pixels are noise. And not the mean: a small press covers a
+    few per cent of the gel.
+    """
     return float(np.percentile(difference[edge:-edge, edge:-edge], PERCENTILE))
 
 
 def _excess_structure(free: np.ndarray, pressed: np.ndarray) -> float:
     """Return how much more edges `pressed` has where the two differ, -1 to 1."""
     region = _changed(free, pressed)
-    edges = (_gradient(_smooth(picture))[region] for picture in (free, pressed))
-    less, more = (float(np.sqrt((one**2).sum(1)).sum()) for one in edges)
+    less = _edges(free, region)
+    more = _edges(pressed, region)
     return (more - less) / (more + less + 1e-6)
 
 
+def _edges(picture: np.ndarray, region: np.ndarray) -> float:
+    """Return the sum of the strengths of the edges in a region bool (h, w)."""
+    gradient = _gradient(_smooth(picture))[region]
+    return float(np.sqrt((gradient**2).sum(1)).sum())
+
+
 def _press_of(free: np.ndarray, pressed: np.ndarray) -> float:
-    """Return the score of the press that `free` shows itself: its share of the edges that change,
-    times their score.
+    """Return the score of the press that `free` shows itself.
 
     A press that gets deeper strengthens edges that are there already. Edges of the untouched gel
-    are others.
+    are others. So the share of the change that is along the edges of `free` (a projection), times
+    the score of the change, is what was there before.
     """
     region = _changed(free, pressed)
-    before, after = (
-        _gradient(_smooth(picture) - _smooth(picture, WIDE))[region] for picture in (free, pressed)
-    )
+    before = _gradient(_smooth(free) - _smooth(free, WIDE))[region]
+    after = _gradient(_smooth(pressed) - _smooth(pressed, WIDE))[region]
     change = after - before
-    return _distance(free, pressed) * float((before * change).sum() / ((change**2).sum() + 1e-6))
+    along = float((before * change).sum() / ((change**2).sum() + 1e-6))
+    return _distance(free, pressed) * along
 
 
 def _changed(free: np.ndarray, pressed: np.ndarray) -> np.ndarray:

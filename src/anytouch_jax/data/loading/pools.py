@@ -1,7 +1,10 @@
-"""Pools to draw from: the stills, clips and matching pairs of a split, cut into strata by modality.
+"""Pools to draw from: stills, clips and matching pairs of a split, in strata by modality.
 
 `find_pools` runs once before the first step. It selects the rows of the split, finds the clips
 among them, and gives each stratum a sampler. The loader then draws from the pools by step number.
+
+A window is one row (a still) or the rows of a clip, oldest first. Its last row is the one that
+labels, images and captions are taken from.
 """
 
 from __future__ import annotations
@@ -28,9 +31,11 @@ from anytouch_jax.data.manifest.manifest import Manifest, ManifestError, sensor_
 from anytouch_jax.data.tokenizer import Tokenizer, load_tokenizer, train_tokenizer
 from anytouch_jax.errors import UserError
 
+# kinds of windows, which index the pools
 STILL = 0
 CLIP = 1
-_NEITHER = 3  # the last stratum: windows without photograph and caption
+_NEITHER = 3  # the last stratum: windows without RGB image and caption
+_STRATA = 4
 # tags that keep the random streams of one seed apart
 _ALIGN = 100
 _ANCHOR = 200
@@ -40,8 +45,13 @@ _FALSE_WORDS = ("", "0", "0.0", "false", "no", "none")
 
 
 class Pool(NamedTuple):
-    """Windows of rows i64 (M, T); for each stratum its ids in `windows` (`members`) and a sampler
-    over these.
+    """Windows of one kind, in strata.
+
+    Attributes:
+        windows: Rows i64 (M, T).
+        quota: How many of each stratum a batch takes.
+        members: For each stratum its ids in `windows`.
+        samplers: For each stratum a sampler over its members.
     """
 
     windows: np.ndarray
@@ -56,8 +66,12 @@ class Pool(NamedTuple):
 
 
 class MatchPool(NamedTuple):
-    """Windows of rows i64 (M, T) for matching, the matches among them, and a sampler over the
-    anchors.
+    """Windows of one kind for matching.
+
+    Attributes:
+        windows: Rows i64 (M, T).
+        matches: The matches among them.
+        anchors: A sampler over the anchors of these.
     """
 
     windows: np.ndarray
@@ -66,8 +80,14 @@ class MatchPool(NamedTuple):
 
 
 class Pools(NamedTuple):
-    """All pools of a run, None or absent if empty; `sensor` i32 (rows,) are sensor-table rows, -1
-    for rows left out.
+    """All pools of a run.
+
+    Attributes:
+        touch: Of stills, and of clips if there are any.
+        match: Of stills and of clips, None if they have no match.
+        sensor: i32 (rows,), rows of the sensor table, -1 for rows that are left out.
+        tokenizer: Of the captions, None without any.
+        notes: Sentences for the user.
     """
 
     touch: tuple[Pool, ...]
@@ -78,11 +98,15 @@ class Pools(NamedTuple):
 
 
 class _Usable(NamedTuple):
-    """Rows that a run may use: `rows` i64 ids that may be drawn; the other arrays have a value per
-    manifest row.
+    """Rows that a run may use. All but `rows` have a value for each row of the manifest.
 
-    `sensor` is as in `Pools`, `weights` f64 draws per epoch (None: 1), `ends` whether a clip may
-    end there. `has_image` and `has_text` are False without a tower.
+    Attributes:
+        sensor: As in `Pools`.
+        rows: i64 ids of rows that may be drawn.
+        weights: f64, draws an epoch, None for 1 each.
+        ends: Whether a clip may end there. Its earlier frames may be rows that are not drawn.
+        has_image: False without an image tower.
+        has_text: False without a text tower.
     """
 
     sensor: np.ndarray
@@ -93,6 +117,7 @@ class _Usable(NamedTuple):
     has_text: np.ndarray
 
     def weights_of(self, windows: np.ndarray) -> np.ndarray | None:
+        """Return the draws an epoch of windows, those of their last rows."""
         if self.weights is None:
             return None
         return self.weights[windows[:, -1]]
@@ -105,58 +130,87 @@ def find_pools(
     devices: int,
     gels: UnitGels | None = None,
 ) -> Pools:
-    """Return the pools of the split `config.data.split`; `devices` sets the multiple of the slots.
+    """Return the pools of the split `config.data.split`.
 
-    `gels` are the pictures that are subtracted, if any are. Rows without one are left out if the
-    model needs one. Raises UserError for an empty split, an unknown sensor, an unfit tokenizer, and
-    for data without a training signal.
+    Args:
+        manifest: The frames.
+        config: Of the run.
+        tokenizer: Of the captions; without it one is read or trained if it is needed.
+        devices: The image and text slots of a batch are a multiple of it.
+        gels: The backgrounds that are subtracted, if any are. Rows without one are left out if the
+            model needs one.
+
+    Raises:
+        UserError: For an empty split, an unknown sensor, an unfit tokenizer, and data without a
+            training signal.
     """
     usable, notes = _usable_rows(manifest, config, gels)
-    captioned = usable.rows[usable.has_text[usable.rows]]
-    if captioned.size and tokenizer is None:
-        tokenizer, note = choose_tokenizer(manifest, captioned, config)
-        notes += note
-    if (
-        captioned.size
-        and tokenizer
-        and config.model.text
-        and tokenizer.vocab_size > config.model.text.vocab
-    ):
-        raise UserError(
-            f"the tokenizer has {tokenizer.vocab_size} tokens but the text tower only "
-            f"{config.model.text.vocab}: "
-            f"set --model.text.vocab {tokenizer.vocab_size} or give another tokenizer"
-        )
+    tokenizer, note = _tokenizer_of(manifest, config, usable, tokenizer)
+    notes += note
     if config.stage == 2 and config.model.text:
         notes += _withheld_notes(manifest, config, usable.rows)
     data = config.data
-    frames = config.model.frames
-    length = frames + config.reconstructs
+    # with the next frame, if it is predicted
+    length = config.model.frames + config.reconstructs
     stills = usable.rows[:, None]
     clips = _clips(manifest, config, usable, length)
     shards = _shards(manifest) if data.parts else None
-    kinds = [(kind, ids) for kind, ids in enumerate((stills, clips)) if len(ids)]
-    touch = tuple(_pool(config, usable, kind, ids, devices, shards) for kind, ids in kinds)
+    touch = tuple(
+        _pool(config, usable, kind, windows, devices, shards)
+        for kind, windows in ((STILL, stills), (CLIP, clips))
+        if len(windows)
+    )
     if len(touch) == 1 and data.clip_share:
         notes.append(
             f"split {data.split!r} has no clip of {length} frames, so all batches are stills"
         )
     match: tuple[MatchPool | None, MatchPool | None] = (None, None)
     if config.stage == 2 and config.model.match_head != "none":
-        clips = clips if length == frames else _clips(manifest, config, usable, frames)
+        # Matching predicts no frame, so its clips are shorter.
+        if length != config.model.frames:
+            clips = _clips(manifest, config, usable, config.model.frames)
         match, note = _match_pools(manifest, config, usable, stills, clips)
         notes += note
         if match[STILL] and match[CLIP] is None and len(touch) > 1:
             notes.append("no two clips share a touch: matching uses stills only")
+    _check_signal(config, touch, match)
+    return Pools(touch, match, usable.sensor, tokenizer, notes)
+
+
+def _tokenizer_of(
+    manifest: Manifest, config: Config, usable: _Usable, tokenizer: Tokenizer | None
+) -> tuple[Tokenizer | None, list[str]]:
+    """Return the tokenizer, chosen if there are captions and none is given, and notes.
+
+    Raises UserError if it has more tokens than the text tower.
+    """
+    captioned = usable.rows[usable.has_text[usable.rows]]
+    if not captioned.size:
+        return tokenizer, []
+    notes: list[str] = []
+    if tokenizer is None:
+        tokenizer, notes = choose_tokenizer(manifest, captioned, config)
+    tower = config.model.text
+    if tokenizer and tower and tokenizer.vocab_size > tower.vocab:
+        raise UserError(
+            f"the tokenizer has {tokenizer.vocab_size} tokens but the text tower only "
+            f"{tower.vocab}: set --model.text.vocab {tokenizer.vocab_size} or give another "
+            "tokenizer"
+        )
+    return tokenizer, notes
+
+
+def _check_signal(
+    config: Config, touch: tuple[Pool, ...], match: tuple[MatchPool | None, MatchPool | None]
+) -> None:
+    """Raise UserError if stage 2 has nothing to learn from these pools."""
     has_modality = any(len(ids) for pool in touch for ids in pool.members[:_NEITHER])
     if config.stage == 2 and not (has_modality or any(match) or config.reconstructs):
         raise UserError(
-            f"stage 2 has nothing to learn from split {data.split!r}. It needs photographs "
-            "(image_path), captions "
-            "(text), or places touched by two sensors (touch). Add one with its tower or head, or "
-            "train stage 1."
+            f"stage 2 has nothing to learn from split {config.data.split!r}. It needs photographs "
+            "(image_path), captions (text), or places touched by two sensors (touch). Add one with "
+            "its tower or head, or train stage 1."
         )
-    return Pools(touch, match, usable.sensor, tokenizer, notes)
 
 
 def _clips(manifest: Manifest, config: Config, usable: _Usable, length: int) -> np.ndarray:
@@ -167,16 +221,20 @@ def _clips(manifest: Manifest, config: Config, usable: _Usable, length: int) -> 
     good = usable.ends[clips[:, -1]]
     for frame in clips.T:
         good &= usable.sensor[frame] >= 0
+    # a copy of millions of clips is spared
     if good.all():
         return clips
     return clips[good]
 
 
 def _shards(manifest: Manifest) -> np.ndarray:
-    """Return the shard of each row, i64 (rows,): its manifest with its path without the entry, or
-    its folder.
+    """Return the shard of each row as a code, i64 (rows,).
+
+    A shard is a file of a manifest, so its path without the entry: touch/0.zip of touch/0.zip/17.
+    For loose files it is their folder. In a Parquet file, the entry has a column too.
     """
-    folder = pc.replace_substring_regex(manifest.column("path").combine_chunks(), r"/[^/]*$", "")
+    path = manifest.column("path").combine_chunks()
+    folder = pc.replace_substring_regex(path, r"/[^/]*$", "")
     place = pc.replace_substring_regex(folder, r"\.parquet/[^/]*$", ".parquet")
     codes = np.asarray(place.dictionary_encode().indices).astype(np.int64)
     return codes * len(manifest.files) + manifest.source
@@ -190,6 +248,7 @@ def _pool(
     devices: int,
     shards: np.ndarray | None,
 ) -> Pool:
+    """Return the pool of windows of one kind, cut into strata in the order of `StratumQuota`."""
     has_image = usable.has_image[windows[:, -1]]
     has_text = usable.has_text[windows[:, -1]]
     strata = (
@@ -199,26 +258,26 @@ def _pool(
         ~has_image & ~has_text,
     )
     members = tuple(np.flatnonzero(stratum) for stratum in strata)
-    samplers: tuple[EpochSampler | PartSampler, ...] = tuple(
-        EpochSampler(
-            len(ids), config.run.seed, _ALIGN + 4 * kind + s, usable.weights_of(windows[ids])
-        )
-        for s, ids in enumerate(members)
-    )
-    if shards is not None:
+    seed = config.run.seed
+    first_tag = _ALIGN + _STRATA * kind
+    samplers: list[EpochSampler | PartSampler]
+    if shards is None:
+        samplers = [
+            EpochSampler(len(ids), seed, first_tag + stratum, usable.weights_of(windows[ids]))
+            for stratum, ids in enumerate(members)
+        ]
+    else:
         if config.stage != 1 or usable.weights is not None:
             raise UserError(
                 "--data.parts is for stage 1 without --data.weights; leave one of them out"
             )
-        size = config.data.batch_size
-        at = shards[windows[:, -1]]
-        none = [EpochSampler(0, 0, 0)] * _NEITHER
-        samplers = (
-            *none,
-            PartSampler(at, size, config.data.parts, config.run.seed, _ALIGN + 4 * kind + _NEITHER),
-        )
+        # In stage 1 nothing has an image or a caption, so all windows are of the last stratum.
+        shard_of = shards[windows[:, -1]]
+        parts = config.data.parts
+        last = PartSampler(shard_of, config.data.batch_size, parts, seed, first_tag + _NEITHER)
+        samplers = [*[EpochSampler(0, 0, 0)] * _NEITHER, last]
     quota = StratumQuota([sampler.size for sampler in samplers], config.data.batch_size, devices)
-    return Pool(windows, quota, members, samplers)
+    return Pool(windows, quota, members, tuple(samplers))
 
 
 def _match_pools(
@@ -228,25 +287,25 @@ def _match_pools(
 
     def codes(name: str, own: bool = False) -> np.ndarray:
         codes = manifest.codes(name, own=own)
+        # half the memory for millions of rows
         if codes.max(initial=0) < 1 << 31:
             return codes.astype(np.int32)
         return codes
 
+    # Names of units, objects and data sets mean the same in every manifest; places do not.
     keys = MatchKeys(
         codes("touch", own=True), usable.sensor, codes("unit"), codes("object"), codes("dataset")
     )
     same_sensor = config.data.negatives == "same_sensor"
-    seed = config.run.seed
+    other_object = config.recipe == "release"
 
     def pool(kind: int, windows: np.ndarray) -> MatchPool | None:
-        other_object = config.recipe == "release"
         matches = Matches(windows[:, -1], keys, same_sensor=same_sensor, other_object=other_object)
         if not matches.anchors.size:
             return None
         weights = usable.weights_of(windows[matches.anchors])
-        return MatchPool(
-            windows, matches, EpochSampler(len(matches.anchors), seed, _ANCHOR + kind, weights)
-        )
+        anchors = EpochSampler(len(matches.anchors), config.run.seed, _ANCHOR + kind, weights)
+        return MatchPool(windows, matches, anchors)
 
     still = pool(STILL, stills)
     clip = pool(CLIP, clips) if config.data.clip_share else None
@@ -267,13 +326,14 @@ def _match_pools(
 def _usable_rows(
     manifest: Manifest, config: Config, gels: UnitGels | None
 ) -> tuple[_Usable, list[str]]:
-    """Return the rows of the split with images of a known sensor, a weight, and all that is
-    required; and notes.
+    """Return the rows of the split that may be drawn, and notes.
+
+    They have an image of a known sensor, a background if the model needs one, a weight, and all
+    that the user requires.
     """
     split = config.data.split
-    on_bad = config.data.on_bad_sample
     rows = manifest.rows_of(split)
-    sensor, notes = sensor_rows(manifest, config.model, rows, unknown=on_bad)
+    sensor, notes = sensor_rows(manifest, config.model, rows, unknown=config.data.on_bad_sample)
     rows = rows[sensor[rows] >= 0]
     if not rows.size:
         files = ", ".join(map(str, manifest.files))
@@ -283,18 +343,9 @@ def _usable_rows(
         )
     if gels is not None:
         notes.append(gels.report(rows))
-        missing = rows[~gels.has(rows)] if config.data.background == "subtract" else rows[:0]
-        if len(missing) == len(rows):
-            raise ManifestError(
-                f"{manifest.where(int(rows[0]))} and {len(rows) - 1} other rows have no picture of "
-                "the untouched gel, "
-                f"which --data.background subtract requires. {ADVICE}"
-            )
+        missing, note = _without_background(manifest, config, rows, gels)
+        notes += note
         if len(missing):
-            notes.append(
-                f"{len(missing)} of {len(rows)} rows have no picture of the untouched gel, and are "
-                "left out"
-            )
             sensor = sensor.copy()
             rows = np.setdiff1d(rows, missing)
             sensor[missing] = -1
@@ -303,29 +354,55 @@ def _usable_rows(
     if weights is not None:
         rows = rows[weights[rows] > 0]
         sensor = np.where(weights > 0, sensor, -1)
-    text = manifest.present("text") & ~withheld_text(
-        manifest, aligned_text=config.data.aligned_text
-    )
-    has = {"image": manifest.present("image_path"), "text": text}
+    withheld = withheld_text(manifest, aligned_text=config.data.aligned_text)
+    has = {"image": manifest.present("image_path"), "text": manifest.present("text") & ~withheld}
     allowed, note = _required(manifest, config, rows, has)
-    model = config.model
+    notes += note
     aligns = config.stage == 2
     none = np.zeros(len(manifest), bool)
-    has_image = has["image"] if aligns and model.image else none
-    has_text = text if aligns and model.text else none
-    return _Usable(sensor, rows[allowed[rows]], weights, allowed, has_image, has_text), notes + note
+    usable = _Usable(
+        sensor=sensor,
+        rows=rows[allowed[rows]],
+        weights=weights,
+        ends=allowed,
+        has_image=has["image"] if aligns and config.model.image else none,
+        has_text=has["text"] if aligns and config.model.text else none,
+    )
+    return usable, notes
+
+
+def _without_background(
+    manifest: Manifest, config: Config, rows: np.ndarray, gels: UnitGels
+) -> tuple[np.ndarray, list[str]]:
+    """Return the rows that are left out for want of a background, and notes.
+
+    Raises ManifestError if these are all.
+    """
+    if config.data.background != "subtract":
+        return rows[:0], []
+    missing = rows[~gels.has(rows)]
+    if len(missing) == len(rows):
+        raise ManifestError(
+            f"{manifest.where(int(rows[0]))} and {len(rows) - 1} other rows have no picture of "
+            f"the untouched gel, which --data.background subtract requires. {ADVICE}"
+        )
+    if not len(missing):
+        return missing, []
+    return missing, [
+        f"{len(missing)} of {len(rows)} rows have no picture of the untouched gel, and are left out"
+    ]
 
 
 def _required(
     manifest: Manifest, config: Config, rows: np.ndarray, has: dict[str, np.ndarray]
 ) -> tuple[np.ndarray, list[str]]:
-    """Return which rows of the manifest `data.require` and `data.contact_only` allow, bool (rows,),
-    and notes.
+    """Return which rows of the manifest the user's requirements allow, bool (rows,), and notes.
+
+    These are `data.require` and `data.contact_only`. `has` says which rows have a modality.
     """
-    wanted = [*config.data.require, *(["contact"] if config.data.contact_only else [])]
-    if not wanted:
-        return np.ones(len(manifest), bool), []
+    wanted: list[str] = [*config.data.require]
     if config.data.contact_only:
+        wanted.append("contact")
         if "label.contact" not in manifest.table.column_names:
             raise UserError(
                 "--data.contact-only needs the column 'label.contact', which `anytouch data "
@@ -333,6 +410,8 @@ def _required(
             )
         # rows of unknown contact stay
         has = {**has, "contact": known_contact(manifest) != 0}
+    if not wanted:
+        return np.ones(len(manifest), bool), []
     allowed = np.logical_and.reduce([has[name] for name in wanted])
     count = int(allowed[rows].sum())
     words = " and ".join(wanted)
@@ -348,19 +427,20 @@ def _required(
 def epoch_weights(
     manifest: Manifest, config: Config, rows: np.ndarray
 ) -> tuple[np.ndarray | None, list[str]]:
-    """Return how often an epoch draws each row of the manifest, f64 (rows,), None if each comes
-    once; and notes.
+    """Return how often an epoch draws each row of the manifest, f64 (rows,), and notes.
+
+    It is None if each row comes once. `rows` are those of the split.
     """
     column = manifest.column("dataset")
     split = config.data.split
     datasets = pc.unique(column.take(rows)).drop_null().to_pylist()
-    wanted = config.data.weights
-    if wanted is not None:  # simulated touches are no rows
-        wanted = tuple(pair for pair in wanted if pair[0] != "simulated")
-    if wanted is None:
+    wanted: tuple[tuple[str, float], ...] = ()
+    if config.data.weights is not None:
+        # simulated touches are no rows
+        wanted = tuple(pair for pair in config.data.weights if pair[0] != "simulated")
+    elif config.recipe == "release" and config.stage == 2:
         # its stage 1 draws every row once
-        released = config.recipe == "release" and config.stage == 2
-        wanted = tuple(pair for pair in RELEASE_WEIGHTS if pair[0] in datasets) if released else ()
+        wanted = tuple(pair for pair in RELEASE_WEIGHTS if pair[0] in datasets)
     for name, weight in wanted:
         if name not in datasets:
             known = ", ".join(sorted(datasets)) or "none: its column 'dataset' is empty"
@@ -371,7 +451,7 @@ def epoch_weights(
             raise UserError(
                 f"--data.weights of {name!r} is the number of draws per epoch, not {weight}"
             )
-    if len(set(dict(wanted))) < len(wanted):
+    if len(dict(wanted)) < len(wanted):
         raise UserError("--data.weights names a dataset twice; name it once")
     if not wanted:
         return None, []
@@ -382,10 +462,10 @@ def epoch_weights(
         raise UserError(
             f"--data.weights leaves out every row of split {split!r}; name a dataset that has some"
         )
-    counts = ", ".join(
+    counts = [
         f"{name} {weight:g} times" if weight else f"{name} not at all" for name, weight in wanted
-    )
-    return weights, [f"an epoch draws {counts}, other datasets once"]
+    ]
+    return weights, [f"an epoch draws {', '.join(counts)}, other datasets once"]
 
 
 def withheld_text(manifest: Manifest, *, aligned_text: bool = True) -> np.ndarray:
@@ -401,12 +481,13 @@ def withheld_text(manifest: Manifest, *, aligned_text: bool = True) -> np.ndarra
 
 
 def _is_aligned(manifest: Manifest) -> np.ndarray:
-    return is_shared_touch(
-        *(manifest.codes(name, own=name == "touch") for name in ("touch", "sensor", "unit"))
-    )
+    """Return the rows whose touch sensors or units share, bool (rows,)."""
+    touch = manifest.codes("touch", own=True)
+    return is_shared_touch(touch, manifest.codes("sensor"), manifest.codes("unit"))
 
 
 def _in_downstream_test(manifest: Manifest) -> np.ndarray:
+    """Return the rows in a test split of a downstream task, bool (rows,)."""
     if _DOWNSTREAM not in manifest.table.column_names:
         return np.zeros(len(manifest), bool)
     word = pc.utf8_lower(manifest.table[_DOWNSTREAM].cast(pa.string()))
@@ -416,24 +497,26 @@ def _in_downstream_test(manifest: Manifest) -> np.ndarray:
 def _withheld_notes(manifest: Manifest, config: Config, rows: np.ndarray) -> list[str]:
     text = manifest.present("text")[rows]
     notes = []
-    if count := int((text & _in_downstream_test(manifest)[rows]).sum()):
+    tested = int((text & _in_downstream_test(manifest)[rows]).sum())
+    if tested:
         notes.append(
-            f"the text of {count} rows is withheld: they are in a test split of a downstream task"
+            f"the text of {tested} rows is withheld: they are in a test split of a downstream task"
         )
     if not config.data.aligned_text:
-        shared = (
-            f"the text of {int((text & _is_aligned(manifest)[rows]).sum())} of {int(text.sum())} "
-            "rows is withheld"
+        shared = int((text & _is_aligned(manifest)[rows]).sum())
+        notes.append(
+            f"the text of {shared} of {int(text.sum())} rows is withheld: other sensors or units "
+            "share the touch (data.aligned_text)"
         )
-        notes.append(f"{shared}: other sensors or units share the touch (data.aligned_text)")
     return notes
 
 
 def training_captions(
     manifest: Manifest, rows: np.ndarray, *, aligned_text: bool = True
 ) -> list[str]:
-    """Return the distinct captions of `rows` that may be trained on (see `withheld_text`),
-    sorted.
+    """Return the distinct captions of `rows` that may be trained on, sorted.
+
+    Which ones may is told by `withheld_text`.
     """
     allowed = rows[~withheld_text(manifest, aligned_text=aligned_text)[rows]]
     return sorted(pc.unique(manifest.column("text").take(allowed)).drop_null().to_pylist())
@@ -447,11 +530,19 @@ def choose_tokenizer(
     file: Path | None = None,
     vocabulary: int | None = None,
 ) -> tuple[Tokenizer | None, list[str]]:
-    """Return the tokenizer of a run, and notes: from `file`, else `data.tokenizer`, else trained on
-    the captions.
+    """Return the tokenizer of a run, None without captions, and notes.
 
-    Captions are those of `rows` that may be trained on; without any it is None. A trained one has
-    at most `vocabulary` tokens, by default as many as the text tower. Raises UserError.
+    It is read from `file`, else from `data.tokenizer`, else trained on the captions.
+
+    Args:
+        manifest: The frames.
+        rows: Rows whose captions it is trained on, as far as these may be.
+        config: Of the run.
+        file: A tokenizer.json or its folder.
+        vocabulary: Most tokens of a trained one, by default as many as the text tower has.
+
+    Raises:
+        UserError: For a file that is missing or unfit.
     """
     path = file or config.data.tokenizer
     if path is not None:

@@ -13,6 +13,7 @@ Batch = TypeVar("Batch")
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 _CHUNK = 4  # jobs per future: enough to hide the hand-over, few enough to stop soon
+_AHEAD = 4  # items per thread that `bounded_map` works ahead
 
 
 @dataclass
@@ -36,10 +37,16 @@ def run_jobs(work: BatchJobs[Batch]) -> tuple[Batch, dict[str, int]]:
 def prefetch_batches(
     plan: Callable[[int], BatchJobs[Batch]], steps: Iterable[int], threads: int, prefetch: int
 ) -> Iterator[tuple[int, Batch, dict[str, int]]]:
-    """Yield (step, batch, info) of every step in order, at most `prefetch` batches ahead.
+    """Yield (step, batch, info) of every step in order.
 
-    The content does not depend on `threads` (0: the caller's). The first failing job raises in the
-    caller. All threads have ended when the iterator ends.
+    The content does not depend on the threads, because each job writes its own slot. The first
+    failing job raises in the caller. All threads have ended when the iterator ends.
+
+    Args:
+        plan: Returns the empty batch of a step and its jobs.
+        steps: The steps.
+        threads: That fill batches; 0 is the caller's own.
+        prefetch: Batches that are filled ahead, at most.
     """
     if threads < 1:
         for step in steps:
@@ -54,7 +61,8 @@ def prefetch_batches(
 
     try:
         for step, work, futures in _ahead(map(begin, steps), prefetch):
-            yield (step, *work.finish(sum(future.result() for future in futures)))
+            skipped = sum(future.result() for future in futures)
+            yield (step, *work.finish(skipped))
     finally:
         executor.shutdown(wait=True, cancel_futures=True)
 
@@ -65,18 +73,23 @@ def bounded_map(
     threads: int,
     ahead: int | None = None,
 ) -> Generator[Result, None, None]:
-    """Yield `function(item)` in order, `ahead` items ahead (4 per thread).
+    """Yield `function(item)` in order.
 
     The first error raises; all threads end.
+
+    Args:
+        function: What is done with each item.
+        items: They are drawn as they are needed, so there may be any number.
+        threads: 0 is the caller's own.
+        ahead: Items that are worked on ahead, by default 4 a thread.
     """
     if threads < 1:
         yield from map(function, items)
         return
     executor = ThreadPoolExecutor(threads, thread_name_prefix="anytouch-files")
+    futures = (executor.submit(function, item) for item in items)
     try:
-        for future in _ahead(
-            (executor.submit(function, item) for item in items), ahead or 4 * threads
-        ):
+        for future in _ahead(futures, ahead or _AHEAD * threads):
             yield future.result()
     finally:
         executor.shutdown(wait=True, cancel_futures=True)

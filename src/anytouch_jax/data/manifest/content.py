@@ -24,8 +24,16 @@ _SHOWN = 20
 
 
 class Summary(NamedTuple):
-    """Numbers of a manifest: `filled` rows by column, `counts` of split and sensor (first values,
-    number of all).
+    """Numbers of a manifest.
+
+    Attributes:
+        rows: Frames.
+        recordings: Sequences.
+        clips: Clips of the length that was asked for.
+        filled: Rows with a value, by column.
+        counts: Of split and sensor: the first values with their rows, and how many values there
+            are.
+        digest: SHA-256 of the content.
     """
 
     rows: int
@@ -51,10 +59,20 @@ def table_blocks(table: pa.Table) -> Blocks:
 def content_digest(
     names: Iterable[str], blocks: Blocks, look: Callable[[str, pa.Array], None] | None = None
 ) -> str:
-    """Return the SHA-256 over every column's name and values; `look` gets each block once."""
+    """Return the SHA-256 over every column's name and values.
+
+    A value counts as text, so that equal tables in CSV and Parquet have equal digests. A column is
+    digested as an Arrow array lies in memory: which values are null, where each value ends, and the
+    text of all.
+
+    Args:
+        names: The columns.
+        blocks: Returns the blocks of a column.
+        look: Gets each block once, for those who count at the same time.
+    """
     digest = hashlib.sha256()
     for name in sorted(names):
-        valid = list[np.ndarray]()
+        valid = [np.zeros(0, bool)]
         lengths = list[np.ndarray]()
         texts = list[memoryview]()
         size = 0
@@ -65,27 +83,44 @@ def content_digest(
             ends, text = _text(block)
             lengths.append(np.diff(ends))
             size += len(text)
-            texts = [*texts, text] if size <= _KEPT else []
+            if size <= _KEPT:
+                texts.append(text)
+            else:
+                texts.clear()
         digest.update(name.encode() + b"\0")
-        digest.update(np.packbits(np.concatenate(valid) if valid else np.zeros(0, bool)).tobytes())
-        end = 0
-        digest.update(np.zeros(1, "<i8").tobytes())
-        for length in lengths:
-            ends = np.cumsum(length, dtype=np.int64)
-            digest.update((ends + end).astype("<i8", copy=False).data)
-            end += int(ends[-1]) if len(ends) else 0
-        for text in texts if size <= _KEPT else (_text(block)[1] for block in blocks(name)):
+        digest.update(np.packbits(np.concatenate(valid)).tobytes())
+        _digest_ends(digest, lengths)
+        if size > _KEPT:
+            # The column is read again rather than kept.
+            for block in blocks(name):
+                digest.update(_text(block)[1])
+        for text in texts:
             digest.update(text)
     return digest.hexdigest()
+
+
+def _digest_ends(digest: hashlib._Hash, lengths: Sequence[np.ndarray]) -> None:
+    """Digest where each value of a column ends, from the lengths of the values of its blocks."""
+    digest.update(np.zeros(1, "<i8").tobytes())
+    end = 0
+    for length in lengths:
+        ends = np.cumsum(length, dtype=np.int64) + end
+        digest.update(ends.astype("<i8", copy=False).data)
+        if len(ends):
+            end = int(ends[-1])
 
 
 def _text(block: pa.Array) -> tuple[np.ndarray, memoryview]:
     """Return where each value ends as text, and the text of all; null is empty."""
     try:
-        text = block if pa.types.is_string(block.type) else block.cast(pa.large_string())
-        text = pc.fill_null(text, "") if text.null_count else text
+        text = block
+        if not pa.types.is_string(block.type):
+            text = block.cast(pa.large_string())
+        if text.null_count:
+            text = pc.fill_null(text, "")
     except pa.ArrowException:  # nested or binary: as Python writes it
         text = pa.array([repr(value) for value in block.to_pylist()], pa.large_string())
+    # The second buffer of an Arrow string array has the ends, the third the text.
     kind = np.int32 if pa.types.is_string(text.type) else np.int64
     ends = np.frombuffer(text.buffers()[1], kind)[text.offset : text.offset + len(text) + 1]
     return ends, memoryview(text.buffers()[2] or b"")[ends[0] : ends[-1]]
@@ -99,7 +134,12 @@ def summarise(
 ) -> Summary:
     """Return the numbers of a table.
 
-    Raises `repeat(rows.., frame_index, sequence)` if a sequence repeats a frame.
+    Args:
+        names: Its columns.
+        blocks: Returns the blocks of a column.
+        length: Frames of a clip.
+        repeat: Makes the error to raise if a sequence repeats a frame, from the first row, the
+            second row, the frame_index and the sequence.
     """
     parts: dict[str, list[Any]] = {
         name: [] for name in ("sequence", "frame_index", "stride", "split", "sensor")
@@ -137,26 +177,25 @@ def summarise(
 
     # they are not stored
     clips = sum(map(len, _blocks(sequence, frame, stride, length, error)[2]))
-    sensors = (
-        pa.concat_tables(parts["sensor"])
-        .group_by("values")
-        .aggregate([("counts", "sum")])
-        .sort_by("values")
-    )
-    first = (column.slice(0, _SHOWN).to_pylist() for column in sensors.columns)
-    splits = sorted(
-        (SPLITS[at], int(count)) for at, count in enumerate(np.bincount(split)) if count
-    )
-    counts = {
-        "split": (splits, len(splits)),
-        "sensor": (list(zip(*first, strict=True)), len(sensors)),
-    }
+    by_sensor = pa.concat_tables(parts["sensor"]).group_by("values")
+    sensors = by_sensor.aggregate([("counts", "sum")]).sort_by("values")
+    values, rows = (column.slice(0, _SHOWN).to_pylist() for column in sensors.columns)
+    of_split = enumerate(np.bincount(split))
+    splits = sorted((SPLITS[at], int(count)) for at, count in of_split if count)
     return Summary(
-        len(frame), len(recordings), clips, {name: filled[name] for name in names}, counts, digest
+        rows=len(frame),
+        recordings=len(recordings),
+        clips=clips,
+        filled={name: filled[name] for name in names},
+        counts={
+            "split": (splits, len(splits)),
+            "sensor": (list(zip(values, rows, strict=True)), len(sensors)),
+        },
+        digest=digest,
     )
 
 
-_MOST = 1 << 61
+_MOST = 1 << 61  # of a key: differences of two keys stay within 64 bits
 _LONGEST = 10**12  # frames of a clip
 _BLOCK = 1 << 18  # rows at a time, so that the intermediate arrays of a block fit into the cache
 
@@ -169,13 +208,24 @@ def clip_windows(
     repeat_error: Callable[[int, int], Exception] | None = None,
     ends: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Return row ids (windows, length) of rows t - (length-1)*stride .. t of one sequence, ordered
-    by t's row id.
+    """Return the windows of rows t - (length-1)*stride .. t of one sequence.
 
-    The ids are i32, beyond 2^31 rows i64. `sequence` (codes), `frame` and `stride` (of row t) are
-    i64 (rows,). A row with a gap, or not in `ends` bool (rows,), has no window. Raises
-    `repeat_error(first row, second row)` if a sequence repeats a frame, and OverflowError for a
-    length above 10^12.
+    A row with a gap before it has no window.
+
+    Args:
+        sequence: Codes i64 (rows,).
+        frame: Frame numbers i64 (rows,).
+        stride: Of the window that ends at each row, i64 (rows,).
+        length: Rows of a window.
+        repeat_error: Makes the error to raise if a sequence repeats a frame, from the first row and
+            the second row.
+        ends: Rows that may be the last of a window, bool (rows,), by default all.
+
+    Returns:
+        Row ids (windows, length), ordered by the last row; i32, or i64 beyond 2^31 rows.
+
+    Raises:
+        OverflowError: For a length above 10^12.
     """
     order, key, blocks = _blocks(sequence, frame, stride, length, repeat_error, ends)
     # there can be millions of windows
@@ -201,9 +251,9 @@ def _blocks(
     repeat_error: Callable[[int, int], Exception] | None,
     ends: np.ndarray | None = None,
 ) -> tuple[np.ndarray | None, np.ndarray, Iterator[np.ndarray]]:
-    """Return (order, key) of `_sorted_keys`, and windows as positions in them, in blocks.
+    """Return the order and keys of `_sorted_keys`, and windows as positions in them, in blocks.
 
-    Raises as `clip_windows`.
+    The arguments are those of `clip_windows`, which raises the same.
     """
     if length < 1:
         raise ValueError(f"a clip has at least one frame, not {length}")
@@ -212,14 +262,12 @@ def _blocks(
     order, key, spread = _sorted_keys(sequence, frame)
     repeats = np.flatnonzero(key[1:] == key[:-1])
     if repeats.size and length > 1:
-        first, second = sorted(
-            int(at if order is None else order[at]) for at in (repeats[0], repeats[0] + 1)
-        )
-        raise (
-            repeat_error(first, second)
-            if repeat_error
-            else ValueError(f"rows {first}, {second}: the same frame")
-        )
+        places = repeats[0] + np.array([0, 1])
+        rows = places if order is None else order[places]
+        first, second = sorted(rows.tolist())
+        if repeat_error is not None:
+            raise repeat_error(first, second)
+        raise ValueError(f"rows {first}, {second}: the same frame")
 
     def blocks() -> Iterator[np.ndarray]:
         for start in range(0, len(key), _BLOCK):
@@ -236,8 +284,14 @@ def _blocks(
 def _windows_ending_at(
     last: np.ndarray, key: np.ndarray, spread: int, stride: np.ndarray, length: int
 ) -> np.ndarray:
-    """Return the whole windows that end at the positions `last` of `key`, as positions i64
-    (windows, length).
+    """Return the whole windows that end at some positions, as positions i64 (windows, length).
+
+    Args:
+        last: Positions i64 (n,) in `key`.
+        key: Sorted keys, see `_sorted_keys`.
+        spread: Of the keys.
+        stride: i64 (n,), of each window.
+        length: Rows of a window.
     """
     windows = np.empty((len(last), length), np.int64)
     windows[:, -1] = last
@@ -246,9 +300,9 @@ def _windows_ending_at(
     stride = np.minimum(stride, spread)
     for back in range(1, length):
         wanted = last_key - back * stride
-        # else the key would be one of the sequence before
+        # Otherwise the key would be one of the sequence before.
         same_sequence = last_key % spread >= back * stride
-        # its position if no frame between is missing
+        # Its position if no frame between is missing, as is usual. The others are searched for.
         at = np.maximum(last - back * stride, 0)
         elsewhere = np.flatnonzero(same_sequence & (key[at] != wanted))
         at[elsewhere] = np.minimum(np.searchsorted(key, wanted[elsewhere]), len(key) - 1)
@@ -260,8 +314,13 @@ def _windows_ending_at(
 def _sorted_keys(
     sequence: np.ndarray, frame: np.ndarray
 ) -> tuple[np.ndarray | None, np.ndarray, int]:
-    """Return (order, key, spread): row ids i64 sorted by sequence and frame (None if sorted), and
-    their keys. A key i64 is sequence * spread + frame. Frames count from 0 and are below `spread`.
+    """Return rows in the order of sequence and frame, by one key for both.
+
+    A key is sequence * spread + frame. Frames count from 0 and are below `spread`, so the key of
+    the frame before is one less, and there is none across sequences.
+
+    Returns:
+        Row ids i64 in order (None if the rows are in order), their keys i64, and the spread.
     """
     if not len(frame):
         return None, np.arange(0), 1

@@ -33,7 +33,7 @@ import pyarrow.parquet
 
 from anytouch_jax.data.manifest.schema import ManifestError, shown
 from anytouch_jax.errors import UserError
-from anytouch_jax.files import atomic_path
+from anytouch_jax.files import atomic_path, cache_folder
 
 MAX_BYTES = 1 << 29  # of one file: an image of images.MAX_PIXELS with four channels of 16 bits
 SHARD_INDEX = np.dtype([("offset", "<i8"), ("size", "<i8"), ("crc", "<u4")])
@@ -41,7 +41,7 @@ _PARQUET_INDEX = np.dtype([("offset", "<i8"), ("size", "<i8"), ("sha256", "u1", 
 _NPY_HEADER_1 = np.lib.format.read_array_header_1_0
 _NPY_HEADER_2 = np.lib.format.read_array_header_2_0
 _TAR_INDEX = np.dtype([("offset", "<i8"), ("size", "<i8")])
-_OPEN = 64  # open shards at once
+_OPEN = 64  # open shards at once: a process may have 1,024 files open
 _HELD = 256 << 20  # bytes of a Parquet column in memory
 # a .npy header is Python text, and the parser of 3.11 can fail in two threads
 _NPY_LOCK = threading.Lock()
@@ -59,9 +59,10 @@ def read_file(path: Path) -> bytes:
     place = split_shard_path(path)
     if place is None:
         return _read_loose(path)
-    return (
-        _column(place[0], path.parent.name) if path.parent != place[0] else _shard(place[0])
-    ).read(place[1])
+    shard, row = place
+    if path.parent == shard:
+        return _shard(shard).read(row)
+    return _column(shard, path.parent.name).read(row)
 
 
 def split_shard_path(path: Path) -> tuple[Path, int] | None:
@@ -92,13 +93,17 @@ def _read_loose(path: Path) -> bytes:
             raise ValueError("it is not a regular file")
         if status.st_size > MAX_BYTES:
             raise ValueError(f"it has {status.st_size} bytes, more than the limit of {MAX_BYTES}")
-        parts = [os.read(file, status.st_size + 1)]
-        if len(parts[0]) != status.st_size:  # it grew, or the read was interrupted
-            while part := os.read(file, status.st_size + 1):
-                parts.append(part)
-        if len(parts) == 1:
-            return parts[0]
-        return b"".join(parts)
+        # One byte more than the size, so that a single call tells that this is all.
+        first = os.read(file, status.st_size + 1)
+        if len(first) == status.st_size:
+            return first
+        # It grew, or the read was interrupted.
+        parts = [first]
+        while True:
+            part = os.read(file, status.st_size + 1)
+            if not part:
+                return b"".join(parts)
+            parts.append(part)
     finally:
         os.close(file)
 
@@ -127,26 +132,43 @@ class _Shard:
             )
         entry = self._index[row]
         size = int(entry["size"])
-        offset = int(entry["offset"])
-        parts = []
-        length = 0
-        while length < size and (part := os.pread(self._file, size - length, offset + length)):
-            parts.append(part)
-            length += len(part)
-        data = parts[0] if len(parts) == 1 else b"".join(parts)
-        if "crc" not in entry.dtype.names and "sha256" not in entry.dtype.names:
-            valid = length == size
-        elif "crc" in entry.dtype.names:
-            valid = zlib.crc32(data) == entry["crc"]
-        else:
-            valid = hashlib.sha256(data).digest() == entry["sha256"].tobytes()
-        if not valid:
-            fault = "cut short" if length < size else "damaged (its checksum does not match)"
+        data = self._bytes(int(entry["offset"]), size)
+        if not _is_valid(data, entry, size):
+            is_short = len(data) < size
+            fault = "cut short" if is_short else "damaged (its checksum does not match)"
             raise ShardError(
                 f"row {row} of the shard is {fault}; copy the shard again from where the data were "
                 "packed"
             )
         return data
+
+    def _bytes(self, offset: int, size: int) -> bytes:
+        """Return the bytes at a place of the shard, fewer if it ends before."""
+        parts = []
+        length = 0
+        while length < size:
+            # `pread` has no position of its own, so threads share the file
+            part = os.pread(self._file, size - length, offset + length)
+            if not part:
+                break
+            parts.append(part)
+            length += len(part)
+        if len(parts) == 1:
+            return parts[0]
+        return b"".join(parts)
+
+
+def _is_valid(data: bytes, entry: np.void, size: int) -> bool:
+    """Return whether the bytes of a file are those that the index of its shard promises.
+
+    A ZIP file has a CRC-32 of each file, a shard of version 1 a SHA-256, and a tar its size only.
+    """
+    fields = entry.dtype.names or ()
+    if "crc" in fields:
+        return bool(zlib.crc32(data) == entry["crc"])
+    if "sha256" in fields:
+        return bool(hashlib.sha256(data).digest() == entry["sha256"].tobytes())
+    return len(data) == size
 
 
 def read_shard_index(path: Path) -> np.ndarray:
@@ -169,11 +191,9 @@ def read_shard_index(path: Path) -> np.ndarray:
         raise ShardError(
             f"{path} is damaged: {error}; copy it again from where the data were packed"
         ) from None
-    if any(
-        entry.compress_type != zipfile.ZIP_STORED or entry.file_size > MAX_BYTES
-        for entry in entries
-    ):
-        raise ShardError(f"{path} is not a shard made by anytouch data pack")
+    for entry in entries:
+        if entry.compress_type != zipfile.ZIP_STORED or entry.file_size > MAX_BYTES:
+            raise ShardError(f"{path} is not a shard made by anytouch data pack")
     # `pack` writes ASCII names and no extra fields, so a local header is 30 bytes and the name.
     places = [
         (entry.header_offset + 30 + len(entry.filename), entry.file_size, entry.CRC)
@@ -224,9 +244,8 @@ class _Column:
         if name not in self._file.schema_arrow.names:
             raise ShardError(f"{path} has no column {name!r}; index the data again")
         groups = self._file.metadata
-        self._starts = np.cumsum(
-            [0, *(groups.row_group(i).num_rows for i in range(groups.num_row_groups))]
-        )
+        sizes = [groups.row_group(i).num_rows for i in range(groups.num_row_groups)]
+        self._starts = np.cumsum([0, *sizes])
         self._lock = threading.Lock()
         self._held = dict[int, pa.ChunkedArray]()
 
@@ -236,26 +255,32 @@ class _Column:
                 f"the shard has {self._starts[-1]} rows, no row {row}; index the data again"
             )
         group = int(np.searchsorted(self._starts, row, "right")) - 1
+        # One thread reads at a time, because a ParquetFile has one position.
         with self._lock:
             if group not in self._held:
-                try:
-                    table = self._file.read_row_group(group, [self._name], use_threads=False)
-                except (pa.ArrowException, OSError) as error:
-                    raise ShardError(
-                        f"row group {group} of the shard is damaged: {error}; download it again"
-                    ) from None
-                while (
-                    self._held
-                    and sum(held.nbytes for held in self._held.values()) + table.nbytes > _HELD
-                ):
-                    self._held.pop(next(iter(self._held)))
-                self._held[group] = table[self._name]
+                self._hold(group)
             cells = self._held[group]
         value = cells[row - int(self._starts[group])].as_py()
-        value = value.get("bytes") if isinstance(value, dict) else value
+        if isinstance(value, dict):  # Hugging Face's pictures are pairs of bytes and path
+            value = value.get("bytes")
         if not isinstance(value, bytes):
             raise ShardError(f"row {row} of the shard has no bytes in column {self._name!r}")
         return value
+
+    def _hold(self, group: int) -> None:
+        """Read a row group into memory, in place of those that came first if there is no room."""
+        try:
+            table = self._file.read_row_group(group, [self._name], use_threads=False)
+        except (pa.ArrowException, OSError) as error:
+            raise ShardError(
+                f"row group {group} of the shard is damaged: {error}; download it again"
+            ) from None
+        while self._held:
+            held = sum(cells.nbytes for cells in self._held.values())
+            if held + table.nbytes <= _HELD:
+                break
+            self._held.pop(next(iter(self._held)))
+        self._held[group] = table[self._name]
 
 
 def _parquet_index(path: Path) -> np.ndarray:
@@ -282,20 +307,22 @@ def unpack_npy(data: bytes) -> np.ndarray:
     stream = io.BytesIO(data)
     try:
         is_old = np.lib.format.read_magic(stream) == (1, 0)
+        read_header = _NPY_HEADER_1 if is_old else _NPY_HEADER_2
         with _NPY_LOCK:
-            shape, fortran, dtype = (_NPY_HEADER_1 if is_old else _NPY_HEADER_2)(stream)
+            shape, fortran, dtype = read_header(stream)
     except Exception:  # a corrupt header fails in the tokenizer, the parser or in NumPy
         raise ValueError("the file is cut short, or its header is corrupt") from None
     if dtype.hasobject:
         raise ValueError("it holds Python objects")
-    if stream.tell() + math.prod(shape) * dtype.itemsize > len(data):
+    count = math.prod(shape)
+    start = stream.tell()
+    if start + count * dtype.itemsize > len(data):
         raise ValueError("the file is cut short")
-    return np.frombuffer(data, dtype, math.prod(shape), stream.tell()).reshape(
-        shape, order="F" if fortran else "C"
-    )
+    values = np.frombuffer(data, dtype, count, start)
+    return values.reshape(shape, order="F" if fortran else "C")
 
 
-# 20 bytes a file; parsing takes about 5 us a file
+# All indexes are kept: 20 bytes a file, and parsing takes about 5 us a file.
 _cached_index = lru_cache(None)(read_shard_index)
 _column = lru_cache(16)(_Column)
 # the least recently used one closes when its last reader is done
@@ -324,6 +351,8 @@ def local_copy(address: str) -> Path:
     try:
         os.utime(target)  # the newest use
     except OSError:
+        # One thread copies, and the others wait for it. A lock for each address would grow without
+        # end; of 64 two addresses rarely share one.
         with _LOCKS[hash(target) % len(_LOCKS)]:
             if not target.exists():
                 _fetch(file, target)
@@ -345,7 +374,10 @@ def _split(address: str) -> tuple[str, str]:
 
 
 def open_store(address: str) -> tuple[Any, str]:
-    """Return the file system of fsspec for an address, and the path in it. Raises UserError."""
+    """Return the file system of fsspec for an address, and the path in it.
+
+    Raises UserError.
+    """
     try:
         import fsspec
 
@@ -359,8 +391,8 @@ def open_store(address: str) -> tuple[Any, str]:
 
 def _fetch(file: str, target: Path) -> None:
     system, path = open_store(file)
-    target.parent.mkdir(parents=True, exist_ok=True)
     try:
+        target.parent.mkdir(parents=True, exist_ok=True)
         size = int(system.size(path) or 0)
         _make_room(size, target)
         with (
@@ -376,7 +408,8 @@ def _fetch(file: str, target: Path) -> None:
     except Exception as error:  # each store has its own kinds, as of httpx and botocore
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise UserError(
-            f"{file} cannot be copied to {target.parent}: {reason}; check access and free space"
+            f"{file} cannot be copied to {target.parent}: {reason}; check access and free space, "
+            "or name another folder in ANYTOUCH_CACHE"
         ) from None
 
 
@@ -398,5 +431,7 @@ def _make_room(size: int, target: Path) -> None:
 
 
 def _folder() -> Path:
-    home = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
-    return Path(os.environ.get("ANYTOUCH_CACHE") or f"{home}/anytouch_jax/shards").expanduser()
+    given = os.environ.get("ANYTOUCH_CACHE")
+    if given:
+        return Path(given).expanduser()
+    return cache_folder() / "shards"

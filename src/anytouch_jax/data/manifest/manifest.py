@@ -1,5 +1,4 @@
-"""Manifests: tables of tactile frames, to read, join, edit and write, and to look up rows, clips
-and files.
+"""Manifests: tables of tactile frames, to read, join, edit and write, and to look up rows in.
 
 One row is one tactile frame (the columns are in `schema.py`), and row numbers count from 0. The
 keys `sequence` and `touch` belong to their file: two joined manifests never share a sequence or a
@@ -11,7 +10,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -44,8 +43,11 @@ KEYS = ("sequence", "touch", "grasp_group")  # columns whose values belong to th
 class Manifest:
     """A checked table of touch frames, from one file or several joined files.
 
-    `table` has typed columns, and `files` are the absolute manifest files. `source` i32 (rows,) is
-    the file of each row, and `number` i64 (rows,) its row number there.
+    Attributes:
+        table: With typed columns.
+        files: The absolute manifest files.
+        source: i32 (rows,), the file of each row.
+        number: i64 (rows,), its row number there.
     """
 
     table: pa.Table
@@ -59,12 +61,10 @@ class Manifest:
     def __repr__(self) -> str:
         counts = {}
         for name in ("split", "sensor"):
-            most = sorted(
-                pc.value_counts(self.column(name)).to_pylist(), key=lambda entry: -entry["counts"]
-            )
-            counts[f"{name}s"] = listed(
-                [f"{entry['values']} {entry['counts']:,}" for entry in most]
-            )
+            entries = pc.value_counts(self.column(name)).to_pylist()
+            most = sorted(entries, key=lambda entry: -entry["counts"])
+            words = [f"{entry['values']} {entry['counts']:,}" for entry in most]
+            counts[f"{name}s"] = listed(words)
         recordings = len(np.unique(self.codes("sequence", own=True)))
         return described(
             f"Manifest {self._name}",
@@ -104,9 +104,8 @@ class Manifest:
 
     def text_column(self, name: str) -> np.ndarray:
         """Return a column as strings (rows,), "" for null."""
-        return np.array(
-            ["" if value is None else str(value) for value in self.column(name).to_pylist()]
-        )
+        cells = self.column(name).to_pylist()
+        return np.array(["" if cell is None else str(cell) for cell in cells])
 
     def number_column(self, name: str) -> np.ndarray:
         """Return a column as f64 (rows,), NaN where it is empty or missing.
@@ -121,8 +120,9 @@ class Manifest:
             raise ManifestError(f"Column {name!r} contains text. It must have numbers.") from None
 
     def codes(self, name: str, *, own: bool = False) -> np.ndarray:
-        """Return a text column as codes i64 (rows,), -1 for null; with `own` files differ (see
-        KEYS).
+        """Return a text column as codes i64 (rows,), -1 for null.
+
+        With `own`, equal values of two files are different (see KEYS).
         """
         indices = self.column(name).combine_chunks().dictionary_encode().indices
         codes = np.asarray(pc.fill_null(indices, -1)).astype(np.int64)
@@ -157,24 +157,35 @@ class Manifest:
         return rows
 
     def clips(self, length: int, split: str | None = None) -> np.ndarray:
-        """Return all clips of `length` frames: row ids i64 (clips, length), oldest first, ordered
-        by their last row.
+        """Return all clips of a number of frames.
 
         A clip is rows of one sequence and one split whose frame_index values are exactly `stride`
-        (of the last row) apart. `split` selects the clips of that split. Raises ManifestError if a
-        sequence repeats a frame.
+        (of the last row) apart.
+
+        Args:
+            length: Frames of a clip.
+            split: Selects the clips of that split.
+
+        Returns:
+            Row ids i64 (clips, length), oldest frame first, ordered by the last row of a clip.
+
+        Raises:
+            ManifestError: If a sequence repeats a frame.
         """
         table = self.table
-        ends = None if split is None else np.zeros(len(self), bool)
-        if split is not None and ends is not None:
+        ends = None
+        if split is not None:
+            ends = np.zeros(len(self), bool)
             ends[self.rows_of(split)] = True
+        # One code for sequence and split, so that no clip crosses splits: a frame of the test split
+        # must not be seen in training.
         sequence = self.codes("sequence", own=True)
         sequence *= len(SPLITS)
         sequence += self.codes("split")
-        has_stride = "stride" in table.column_names
-        stride = (
-            np.asarray(table["stride"]) if has_stride else np.broadcast_to(np.int64(1), len(self))
-        )
+        if "stride" in table.column_names:
+            stride = np.asarray(table["stride"])
+        else:
+            stride = np.broadcast_to(np.int64(1), len(self))
 
         def repeats(first: int, second: int) -> ManifestError:
             frame = self.value(second, "frame_index")
@@ -190,19 +201,21 @@ class Manifest:
 
     @cached_property
     def content_hash(self) -> str:
-        """SHA-256 over every column's name and values: equal tables in CSV and Parquet have equal
-        hashes.
+        """SHA-256 over every column's name and values.
+
+        Equal tables in CSV and Parquet have equal hashes.
         """
         return content_digest(self.table.column_names, table_blocks(self.table))
 
     @cached_property
     def _cells(self) -> dict[str, Any]:
-        # A table makes a list of its names and a new column object at each look-up.
-        columns = {name: self.table[name] for name in self.table.column_names}
-        return {
-            name: column.chunk(0) if column.num_chunks == 1 else column
-            for name, column in columns.items()
-        }
+        # A table makes a list of its names and a new column object at each look-up, which takes
+        # longer than the look-up. So does a column of chunks.
+        cells = {}
+        for name in self.table.column_names:
+            column = self.table[name]
+            cells[name] = column.chunk(0) if column.num_chunks == 1 else column
+        return cells
 
     @cached_property
     def _roots(self) -> tuple[str, ...]:
@@ -246,14 +259,13 @@ def summarise_file(path: str | Path, length: int = 3) -> Summary:
         table = read(path).table
         names = table.column_names
         blocks = table_blocks(table)
+
+    def repeats(first: int, second: int, frame: int, sequence: str) -> ManifestError:
+        places = schema.place_of(file, first), schema.place_of(file, second)
+        return _repeats(*places, frame, sequence)
+
     try:
-        place = partial(schema.place_of, file)
-        return summarise(
-            names,
-            blocks,
-            length,
-            lambda first, second, *it: _repeats(place(first), place(second), *it),
-        )
+        return summarise(names, blocks, length, repeats)
     except OverflowError as error:
         raise ManifestError(f"{file}: {error}") from None
 
@@ -267,8 +279,7 @@ def _real_file(path: Path) -> Path:
     if path.is_symlink() and path.suffix and not file.suffix:
         raise ManifestError(
             f"{path} is a link into a cache, as its pictures may be; download the data into a "
-            "separate folder "
-            "(hf download --local-dir)"
+            "separate folder (hf download --local-dir)"
         )
     return file
 
@@ -287,18 +298,11 @@ def from_columns(columns: Mapping[str, Any], path: str | Path) -> Manifest:
 
 
 def _join(tables: list[pa.Table], files: tuple[Path, ...]) -> Manifest:
-    kinds: dict[str, set[bool]] = {}
-    for field in (
-        field for table in tables for field in table.schema if not pa.types.is_null(field.type)
-    ):
-        kinds.setdefault(field.name, set()).add(schema.is_text(field.type))
+    """Return the manifest of tables, one below the other."""
     try:
         # A label that is a number in one manifest and text in another becomes text in all of them.
-        for name in (name for name, several in kinds.items() if len(several) > 1):
-            tables = [
-                _with_column(t, name, t[name].cast(pa.string())) if name in t.column_names else t
-                for t in tables
-            ]
+        mixed = _mixed_columns(tables)
+        tables = [_as_text(table, mixed) for table in tables]
         table = pa.concat_tables(tables, promote_options="permissive")
     except pa.ArrowException as error:
         raise ManifestError(f"{', '.join(map(str, files))} cannot be joined: {error}") from None
@@ -310,6 +314,23 @@ def _join(tables: list[pa.Table], files: tuple[Path, ...]) -> Manifest:
     return Manifest(table.combine_chunks(), files, source, number)
 
 
+def _mixed_columns(tables: list[pa.Table]) -> list[str]:
+    """Return the columns that are text in some tables and something else in others."""
+    is_text: dict[str, set[bool]] = {}
+    for table in tables:
+        for field in table.schema:
+            if not pa.types.is_null(field.type):  # an empty column is neither
+                is_text.setdefault(field.name, set()).add(schema.is_text(field.type))
+    return [name for name, answers in is_text.items() if len(answers) > 1]
+
+
+def _as_text(table: pa.Table, names: Sequence[str]) -> pa.Table:
+    for name in names:
+        if name in table.column_names:
+            table = _with_column(table, name, table[name].cast(pa.string()))
+    return table
+
+
 def _with_column(table: pa.Table, name: str, column: Any) -> pa.Table:
     if name in table.column_names:
         return table.set_column(table.column_names.index(name), name, column)
@@ -317,11 +338,14 @@ def _with_column(table: pa.Table, name: str, column: Any) -> pa.Table:
 
 
 def write(manifest: Manifest, path: str | Path) -> None:
-    """Write a manifest as .csv or .parquet, atomically; its paths become relative to the new
-    folder.
+    """Write a manifest as .csv or .parquet, atomically.
 
-    Keys that two joined manifests share become different. Raises ManifestError for another ending,
-    for a file outside the new folder, and for a column that the format cannot hold.
+    Its paths become relative to the new folder, and keys that two joined manifests share become
+    different.
+
+    Raises:
+        ManifestError: For another ending, for a file outside the new folder, and for a column that
+            the format cannot hold.
     """
     target, table = placed(manifest, path)
     table = with_distinct_keys(manifest, table)
@@ -352,40 +376,40 @@ def placed(manifest: Manifest, path: str | Path) -> tuple[Path, pa.Table]:
         if not Path(file).is_relative_to(folder):
             raise ManifestError(
                 f"{manifest.where(row)}: {file} is not inside {folder}, where the manifest is to "
-                "be written; "
-                "write it above its files"
+                "be written; write it above its files"
             )
         return Path(file).relative_to(folder).as_posix()
 
     if any(file.parent != folder for file in manifest.files):
         for name in set(PATHS) & set(table.column_names):
-            cells = [
-                cell and relative(row, cell) for row, cell in enumerate(table[name].to_pylist())
-            ]
+            cells = table[name].to_pylist()
+            for row, cell in enumerate(cells):
+                if cell:
+                    cells[row] = relative(row, cell)
             table = _with_column(table, name, pa.array(cells, pa.string()))
     return target, table
 
 
 def with_distinct_keys(manifest: Manifest, table: pa.Table) -> pa.Table:
-    """Return `table` with a prefix on keys that two files share, because in one file equal keys
-    would be one.
+    """Return `table` with a prefix on keys that two files share.
+
+    In one file equal keys would be one.
     """
-    for name in KEYS if len(manifest.files) > 1 else ():
+    if len(manifest.files) == 1:
+        return table
+    for name in KEYS:
         if name not in table.column_names:
             continue
         codes = manifest.codes(name)
-        column = manifest.table[name]
         known = codes >= 0
-        pairs = np.unique(
-            np.stack([codes[known], manifest.source[known].astype(np.int64)], 1), axis=0
-        )
-        if len(pairs) > len(np.unique(pairs[:, 0])):
-            prefix = pa.array([f"{number}/" for number in range(len(manifest.files))]).take(
-                pa.array(manifest.source)
-            )
-            cells = pc.binary_join_element_wise(
-                prefix, column.combine_chunks().cast(pa.string()), ""
-            )
+        source = manifest.source[known].astype(np.int64)
+        pairs = np.unique(np.stack([codes[known], source], 1), axis=0)
+        has_shared = len(pairs) > len(np.unique(pairs[:, 0]))
+        if has_shared:
+            prefixes = pa.array([f"{number}/" for number in range(len(manifest.files))])
+            prefix = prefixes.take(pa.array(manifest.source))
+            keys = manifest.table[name].combine_chunks().cast(pa.string())
+            cells = pc.binary_join_element_wise(prefix, keys, "")
             table = _with_column(table, name, pa.chunked_array([cells]))
     return table
 
@@ -397,12 +421,19 @@ def sensor_rows(
     *,
     unknown: Literal["error", "skip", "universal"] = "error",
 ) -> tuple[np.ndarray, list[str]]:
-    """Return the sensor-table row of every manifest row, i32 (rows,), -1 for rows to leave out, and
-    notes.
+    """Return the sensor-table row of every manifest row, i32 (rows,), and notes.
 
-    Only `rows` (default: all) are considered. Force fields are left out. A sensor outside
-    `model.sensors` is an error, is left out (`skip`), or uses the universal tokens (`universal`).
-    Raises ManifestError, which names the first row.
+    It is -1 for rows to leave out, as those of force fields.
+
+    Args:
+        manifest: The frames.
+        model: Has the sensor table.
+        rows: The rows that are considered, by default all.
+        unknown: A sensor outside the table is an error, is left out (`skip`), or uses the universal
+            tokens (`universal`). A misspelt name is always an error.
+
+    Raises:
+        ManifestError: Names the first row.
     """
     ids = np.full(len(manifest), -1, np.int32)
     rows = np.arange(len(manifest)) if rows is None else np.unique(rows)
@@ -439,11 +470,13 @@ def misspelt_sensors(
 
     New names are no fault.
     """
-    for rows in sorted(
-        manifest.groups("sensor"), key=lambda rows: str(manifest.value(rows[0], "sensor"))
-    ):
+
+    def sensor(rows: np.ndarray) -> str:
+        return str(manifest.value(rows[0], "sensor"))
+
+    for rows in sorted(manifest.groups("sensor"), key=sensor):
         try:
-            check_spelling(str(manifest.value(rows[0], "sensor")))
+            check_spelling(sensor(rows))
         except SpellingError as error:
             yield "error", f"{rows.size} rows are of {error}", rows
 
@@ -469,19 +502,18 @@ def resolve_path(root: str | Path, relative: str | None) -> Path:
     if ("\\" in relative or relative[1:3] == ":/") and not os.path.lexists(path):
         raise ManifestError(
             f"the path {text} is written as on Windows; write it relative to the manifest's "
-            "folder, with forward "
-            "slashes (touch/0.png)"
+            "folder, with forward slashes (touch/0.png)"
         )
     if relative[0] == "/":
         raise ManifestError(
             f"the path {text} is absolute; write it relative to the manifest's folder, {root}"
         )
-    if not path.startswith(root if root[-1] == "/" else f"{root}/"):
-        link = ", by a link; put the files there, or move the manifest next to them"
-        raise ManifestError(
-            f"the path {text} leaves the folder of the manifest, "
-            f"{root}{'' if '..' in relative.split('/') else link}"
-        )
+    inside = root if root[-1] == "/" else f"{root}/"
+    if not path.startswith(inside):
+        message = f"the path {text} leaves the folder of the manifest, {root}"
+        if ".." not in relative.split("/"):
+            message += ", by a link; put the files there, or move the manifest next to them"
+        raise ManifestError(message)
     return Path(path)
 
 
@@ -494,8 +526,9 @@ def _real_folder(root: str, head: str) -> str:
 
 
 def select_rows(manifest: Manifest, rows: np.ndarray) -> Manifest:
-    """Return the manifest of `rows` (ids i64) in the order given; errors still name the rows of the
-    original files.
+    """Return the manifest of `rows` (ids i64) in the order given.
+
+    Errors still name the rows of the original files.
     """
     rows = np.asarray(rows, np.int64)
     return Manifest(
@@ -509,8 +542,15 @@ def select_rows(manifest: Manifest, rows: np.ndarray) -> Manifest:
 def group_rows(
     rows: np.ndarray, keys: np.ndarray, order: np.ndarray | None = None
 ) -> list[np.ndarray]:
-    """Return `rows` (ids i64) by equal `keys` (rows,) or (rows, k), in the order of keys, then of
-    `order` and row.
+    """Return row ids in groups of equal keys.
+
+    Args:
+        rows: Ids i64 (n,).
+        keys: Of each row, (n,) or (n, k).
+        order: (n,), the order of the rows in a group, by default that of their ids.
+
+    Returns:
+        Ids of each group, the groups in the order of their keys.
     """
     if not len(rows):
         return []
@@ -521,17 +561,18 @@ def group_rows(
 
 def replace_column(manifest: Manifest, name: str, values: Any) -> Manifest:
     """Return the manifest with column `name` set to `values` (rows,), appended if it was absent."""
-    column = (
-        pa.array(values, SCHEMA.get(name))
-        if not isinstance(values, pa.Array | pa.ChunkedArray)
-        else values
-    )
-    return replace(manifest, table=_with_column(manifest.table, name, column))
+    if not isinstance(values, pa.Array | pa.ChunkedArray):
+        values = pa.array(values, SCHEMA.get(name))
+    return replace(manifest, table=_with_column(manifest.table, name, values))
 
 
 class Files(NamedTuple):
-    """Distinct files i < n: `code[column]` i64 (rows,), -1 for null, and the first `row` i64 (n,)
-    and `column` (n,).
+    """The n distinct files of a manifest.
+
+    Attributes:
+        code: For each column the file of each row, i64 (rows,), -1 for null.
+        row: i64 (n,), the first row that names a file.
+        column: (n,), the column in which it does.
     """
 
     code: dict[str, np.ndarray]
@@ -543,18 +584,14 @@ class Files(NamedTuple):
 
 
 def distinct_files(manifest: Manifest, columns: Sequence[str] = PATHS) -> Files:
-    """Return the files of the path columns `columns`, each once (by its written path and its
-    manifest).
-    """
+    """Return the files of some path columns, each once, by its written path and its manifest."""
     columns = [name for name in columns if name in manifest.table.column_names]
     rows = len(manifest)
-    cells = pa.chunked_array(
-        [chunk for name in columns for chunk in manifest.table[name].chunks], pa.string()
-    )
-    encoded = cells.dictionary_encode().unify_dictionaries()
-    number = np.concatenate(
-        [np.asarray(pc.fill_null(chunk.indices, -1)) for chunk in encoded.chunks]
-    ).astype(np.int64)
+    # All columns one below the other: place i is row i % rows of column i // rows.
+    chunks = [chunk for name in columns for chunk in manifest.table[name].chunks]
+    encoded = pa.chunked_array(chunks, pa.string()).dictionary_encode().unify_dictionaries()
+    codes = [np.asarray(pc.fill_null(chunk.indices, -1)) for chunk in encoded.chunks]
+    number = np.concatenate(codes).astype(np.int64)
     key = number * len(manifest.files) + np.tile(manifest.source.astype(np.int64), len(columns))
     known = np.flatnonzero(number >= 0)
     _, first, code = np.unique(key[known], return_index=True, return_inverse=True)

@@ -28,7 +28,9 @@ PATHS = ("path", "image_path", "image2_path", "background_path", "field_path")
 # Spellings of an unknown value, in small letters. Spreadsheets write #N/A, and pandas <NA>.
 EMPTY = ("", "na", "n/a", "n.a.", "#n/a", "<na>", "nan", "none", "null", "nil", "-", "--", "?")
 
+EXAMPLES = 5  # rows that a report on many rows names
 MAX_ROWS = 20_000_000  # of a manifest file
+_LISTED = 20  # names in a message
 MAX_TEXT = 10_000  # bytes of a text cell in the columns that are used
 _SPACES = r"[\s\p{Z}\x{200B}\x{FEFF}]+"
 NUMBER = r"^[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$"
@@ -49,21 +51,19 @@ Cast = Callable[[pa.ChunkedArray], pa.ChunkedArray]
 
 
 class ManifestError(UserError):
-    """A manifest that cannot be used; the message names the file, the column, and the line or row
-    (`place_of`).
+    """A manifest that cannot be used.
+
+    The message names the file, the column, and the line or row (`place_of`).
     """
 
 
 def is_manifest(path: Path) -> bool:
-    """Return whether the file in `path` has the columns of a manifest; its values are not
-    checked.
-    """
+    """Return whether a file has the columns of a manifest; its values are not checked."""
     try:
-        names = (
-            pa.parquet.read_schema(path).names
-            if path.suffix.lower() == ".parquet"
-            else _csv_names(path)
-        )
+        if path.suffix.lower() == ".parquet":
+            names = pa.parquet.read_schema(path).names
+        else:
+            names = _csv_names(path)
     except (pa.ArrowException, UnicodeDecodeError, csv.Error):
         return False
     return set(REQUIRED) <= {name.strip() for name in names}
@@ -112,27 +112,32 @@ def shown(value: object) -> str:
 
 
 def listed(names: Sequence[str], count: int | None = None) -> str:
-    """Return the first twenty of `count` names for a message, each with 50 characters at most, and
-    how many follow.
+    """Return the first twenty names for a message, and how many of `count` follow.
+
+    Each has 50 characters at most.
     """
-    count = len(names) if count is None else count
-    more = f" and {count - 20:,} more" if count > 20 else ""
-    return ", ".join(name[:50] for name in names[:20]) + more
+    if count is None:
+        count = len(names)
+    first = ", ".join(name[:50] for name in names[:_LISTED])
+    if count > _LISTED:
+        first += f" and {count - _LISTED:,} more"
+    return first
 
 
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
     """Turn errors of reading a table into a ManifestError that names the file."""
     try:
-        if kind := placeholder(path):
+        kind = placeholder(path)
+        if kind:
             raise ManifestError(f"{path} is {kind}")
         yield
     except (pa.ArrowException, UnicodeDecodeError, csv.Error, OSError) as error:
-        reason = (
-            getattr(error, "strerror", None) or str(error) or type(error).__name__
-        ).splitlines()[0][:500]
-        kind = path.suffix.lower()[1:]
-        raise ManifestError(f"{path} cannot be read as a {kind} table: {reason}") from None
+        said = getattr(error, "strerror", None) or str(error) or type(error).__name__
+        # Arrow's errors go on with where in its sources they arose.
+        reason = said.splitlines()[0][:500]
+        form = path.suffix.lower()[1:]
+        raise ManifestError(f"{path} cannot be read as a {form} table: {reason}") from None
 
 
 def read_text_csv(path: Path) -> pa.Table:
@@ -149,23 +154,31 @@ def read_text_csv(path: Path) -> pa.Table:
         parse = pa.csv.ParseOptions(newlines_in_values=True)
         try:
             table = pa.csv.read_csv(path, convert_options=convert, parse_options=parse)
-            if any(
-                pc.any(pc.match_substring_regex(column, r"[\r\n]")).as_py()
-                for column in table.columns
-            ):
-                # Arrow takes the rows after a quote that is not closed for its text
-                deque(csv_lines(path), 0)
-            return table.rename_columns([name.strip() for name in table.column_names])
         except pa.ArrowInvalid:
-            odd = ((line, cells) for line, cells in csv_lines(path) if len(cells) != len(names))
-            line, cells = next(odd, (0, []))
+            line, cells = _first_odd_line(path, len(names))
             if not line:
                 raise
-    raise ManifestError(
-        f"{path}, line {line}: {len(cells)} cells for {len(names)} columns, in "
-        f"{shown(','.join(cells))}; quote cells "
-        "with commas, and close each quote"
-    )
+            raise ManifestError(
+                f"{path}, line {line}: {len(cells)} cells for {len(names)} columns, in "
+                f"{shown(','.join(cells))}; quote cells with commas, and close each quote"
+            ) from None
+        if any(_has_line_breaks(column) for column in table.columns):
+            # Arrow takes the rows after a quote that is not closed for its text. Python's reader
+            # raises for it.
+            deque(csv_lines(path), 0)
+        return table.rename_columns([name.strip() for name in table.column_names])
+
+
+def _first_odd_line(path: Path, columns: int) -> tuple[int, list[str]]:
+    """Return the first line with another number of cells, and these; line 0 without one."""
+    for line, cells in csv_lines(path):
+        if len(cells) != columns:
+            return line, cells
+    return 0, []
+
+
+def _has_line_breaks(column: pa.ChunkedArray) -> bool:
+    return bool(pc.any(pc.match_substring_regex(column, r"[\r\n]")).as_py())
 
 
 def _csv_names(path: Path) -> list[str]:
@@ -173,8 +186,9 @@ def _csv_names(path: Path) -> list[str]:
 
 
 def place_of(path: Path, row: int) -> str:
-    """Return "line 5 of m.csv", as an editor counts lines, or "row 3 of m.parquet", counted from 0,
-    for errors.
+    """Return where a row is, for errors.
+
+    That is "line 5 of m.csv", as an editor counts lines, or "row 3 of m.parquet", counted from 0.
     """
     if path.suffix.lower() == ".csv":
         with suppress(OSError, UnicodeDecodeError, csv.Error, IndexError):
@@ -203,11 +217,8 @@ def _load_parquet(path: Path) -> pa.Table:
         # two threads cannot share a file
         with pa.parquet.ParquetFile(path) as file:
             table = file.read(part, use_threads=False)
-        return (
-            pa.table({name: _checked(name, table[name], path) for name in part})
-            .combine_chunks()
-            .columns
-        )
+        checked = pa.table({name: _checked(name, table[name], path) for name in part})
+        return checked.combine_chunks().columns
 
     with ThreadPoolExecutor(_READERS) as pool:
         columns = [column for part in pool.map(load, range(0, len(names), size)) for column in part]
@@ -239,42 +250,48 @@ def parquet_blocks(path: Path) -> tuple[list[str], Callable[[str], Iterator[pa.A
 def typed(table: pa.Table, path: Path) -> pa.Table:
     """Return `table` with the types of SCHEMA, blank text as null, and every value checked.
 
-    Other columns stay unchanged. Raises ManifestError, which names the place in `path`, for a
-    missing column or value, a wrong type, an unknown split, and a stride below 1. So it does for
-    text that is not UTF-8 or too long, and for too many rows or none.
+    Other columns stay unchanged.
+
+    Raises:
+        ManifestError: Names the place in `path`. For a missing column or value, a wrong type, an
+            unknown split, a stride below 1, text that is not UTF-8 or too long, and for too many
+            rows or none.
     """
     _check_names(table.column_names, table.num_rows, path)
-    return pa.table(
-        {name: _checked(name, table[name], path) for name in table.column_names}
-    ).combine_chunks()
+    checked = {name: _checked(name, table[name], path) for name in table.column_names}
+    return pa.table(checked).combine_chunks()
 
 
 def typed_label(
     column: pa.ChunkedArray, name: str = "", where: Callable[[int], str] | None = None
 ) -> pa.ChunkedArray:
-    """Return a text column as numbers or truth values if all cells are; 007 stays text, because its
-    zeros matter.
+    """Return a text column as numbers or truth values if all cells are; 007 stays text.
 
-    With `where`, which names a row, raises ManifestError for a class in two spellings, or a text
-    among nine times as many numbers.
+    Args:
+        column: Text.
+        name: Its name, for errors.
+        where: Names a row. With it, a class in two spellings, and a text among nine times as many
+            numbers, are errors.
+
+    Raises:
+        ManifestError: For these.
     """
     column = clean_text(column)
-    kinds = (_WHOLE, pa.float64(), pa.bool_())
-    for kind in () if pc.any(pc.match_substring_regex(column, r"^[-+]?0\d")).as_py() else kinds:
-        with suppress(pa.ArrowInvalid):
-            return _decimal(column).cast(kind)
+    # 007 names an object, and as a number it would lose its zeros.
+    has_leading_zeros = pc.any(pc.match_substring_regex(column, r"^[-+]?0\d")).as_py()
+    if not has_leading_zeros:
+        for kind in (_WHOLE, pa.float64(), pa.bool_()):
+            with suppress(pa.ArrowInvalid):
+                return _decimal(column).cast(kind)
     if where is not None:
         _check_label(name, column, where)
     return column
 
 
 def clean_text(column: pa.ChunkedArray) -> pa.ChunkedArray:
-    """Return a text column in Unicode form NFC with single spaces, where every spelling of EMPTY is
-    null.
-    """
-    column = pc.utf8_trim(
-        pc.replace_substring_regex(pc.utf8_normalize(column, "NFC"), _SPACES, " "), " "
-    )
+    """Return a text column in Unicode form NFC with single spaces, and EMPTY words as null."""
+    composed = pc.utf8_normalize(column, "NFC")
+    column = pc.utf8_trim(pc.replace_substring_regex(composed, _SPACES, " "), " ")
     is_empty = pc.is_in(pc.utf8_lower(column), value_set=pa.array(EMPTY))
     return pc.if_else(is_empty, pa.scalar(None, _TEXT), column)
 
@@ -283,9 +300,8 @@ def spellings(values: Iterable[str]) -> list[list[str]]:
     """Return the groups of values that differ by spaces, letter case or Unicode form only."""
     groups: dict[str, list[str]] = {}
     for value in dict.fromkeys(values):
-        groups.setdefault(
-            " ".join(unicodedata.normalize("NFKC", value).casefold().split()), []
-        ).append(value)
+        folded = unicodedata.normalize("NFKC", value).casefold()
+        groups.setdefault(" ".join(folded.split()), []).append(value)
     return [group for group in groups.values() if len(group) > 1]
 
 
@@ -294,8 +310,7 @@ def _check_label(name: str, column: pa.ChunkedArray, where: Callable[[int], str]
         places = [where(pc.index(column, text).as_py()) for text in (other, first)]
         raise ManifestError(
             f"{places[0]}: column {name!r} has {shown(other)}, and {places[1]} has {shown(first)}; "
-            "write one class in "
-            "one way"
+            "write one class in one way"
         )
     is_number = np.asarray(pc.fill_null(pc.match_substring_regex(column, NUMBER), False))
     words = np.flatnonzero(np.asarray(pc.is_valid(column)) & ~is_number)
@@ -336,23 +351,55 @@ def is_text(kind: pa.DataType) -> bool:
 
 
 def _checked(name: str, column: pa.ChunkedArray, path: Path, first: int = 0) -> pa.ChunkedArray:
-    """Return a column in its type, checked, from row `first` of the file.
+    """Return a column in its type, checked.
 
-    Raises ManifestError with a place.
+    Args:
+        name: Its name, which SCHEMA may know.
+        column: As it was read.
+        path: The file, for errors.
+        first: The row of the file that it begins with.
+
+    Raises:
+        ManifestError: With a place.
     """
 
     def refuse(bad: pa.ChunkedArray, problem: Callable[[int], str]) -> None:
+        """Raise for the first row that is bad."""
         row = pc.index(bad, True).as_py()
         if row >= 0:
             raise ManifestError(
                 f"{place_of(path, first + row)}: column {shown(name)} {problem(row)}"
             )
 
+    column = _cast(name, column, path, first)
+    if name in REQUIRED:
+        refuse(pc.is_null(column), lambda _: "is empty")
+    is_label = name.startswith("label.")
+    if is_label and is_text(column.type):  # polars writes large_string
+        column = column.cast(_TEXT)
+    if pa.types.is_string(column.type) and (name in SCHEMA or is_label):
+        length = pc.binary_length(column)
+        refuse(
+            pc.greater(length, MAX_TEXT),
+            lambda row: f"has a text of {length[row]} bytes, more than {MAX_TEXT:,}",
+        )
+    if name == "split":
+        unknown = pc.invert(pc.is_in(column, value_set=pa.array(SPLITS)))
+        refuse(unknown, lambda row: _unknown_split(column[row].as_py()))
+    if name == "stride":
+        column = pc.fill_null(column, 1)
+        refuse(pc.less(column, 1), lambda row: f"must be at least 1, is {column[row]}")
+    return column
+
+
+def _cast(name: str, column: pa.ChunkedArray, path: Path, first: int) -> pa.ChunkedArray:
+    """Return a column in its type; the arguments are those of `_checked`."""
     for cast, kind in ((_plain, "UTF-8 text"), _CASTS[SCHEMA.get(name)]):
         try:
             column = cast(column)
         except pa.ArrowInvalid:
             row = _first_invalid(column, cast)
+            # a text that is not UTF-8 cannot be shown
             value = "" if cast is _plain else f", is {shown(column[row].as_py())}"
             raise ManifestError(
                 f"{place_of(path, first + row)}: column {shown(name)} must be {kind}{value}"
@@ -361,33 +408,17 @@ def _checked(name: str, column: pa.ChunkedArray, path: Path, first: int = 0) -> 
             raise ManifestError(
                 f"{path}: column {name!r} must be {kind}, is {column.type}"
             ) from None
-    if name in REQUIRED:
-        refuse(pc.is_null(column), lambda _: "is empty")
-    if name.startswith("label.") and is_text(column.type):  # polars writes large_string
-        column = column.cast(_TEXT)
-    if pa.types.is_string(column.type) and (name in SCHEMA or name.startswith("label.")):
-        length = pc.binary_length(column)
-        refuse(
-            pc.greater(length, MAX_TEXT),
-            lambda row: f"has a text of {length[row]} bytes, more than {MAX_TEXT:,}",
-        )
-    if name == "split":
-        unknown = pc.invert(pc.is_in(column, value_set=pa.array(SPLITS)))
-        choices = ", ".join(SPLITS)
-
-        def problem(row: int) -> str:
-            value = column[row].as_py()
-            near = difflib.get_close_matches(
-                value[:50].strip().lower().replace("validation", "val"), SPLITS, 1
-            )
-            guess = f"; did you mean {near[0]}?" if near else ""
-            return f"must be one of {choices}, is the unknown split {shown(value)}{guess}"
-
-        refuse(unknown, problem)
-    if name == "stride":
-        column = pc.fill_null(column, 1)
-        refuse(pc.less(column, 1), lambda row: f"must be at least 1, is {column[row]}")
     return column
+
+
+def _unknown_split(value: str) -> str:
+    """Return what is wrong with a split, and the nearest one that there is."""
+    problem = f"must be one of {', '.join(SPLITS)}, is the unknown split {shown(value)}"
+    word = value[:50].strip().lower().replace("validation", "val")
+    near = difflib.get_close_matches(word, SPLITS, 1)
+    if near:
+        problem += f"; did you mean {near[0]}?"
+    return problem
 
 
 def _plain(column: pa.ChunkedArray) -> pa.ChunkedArray:

@@ -165,8 +165,7 @@ def index(
         )
         raise DatasetError(
             f"{base} has no frame of {name} that could be used: expected {reader.layout} in it; is "
-            "ROOT "
-            f"the folder that holds {reader.layout.split('/')[0]!r}? Left out: "
+            f"ROOT the folder that holds {reader.layout.split('/')[0]!r}? Left out: "
             f"{reasons or 'nothing'}"
         )
     constant = {"dataset": name, "license": reader.license, "commercial": reader.commercial}
@@ -200,8 +199,7 @@ def _target(base: Path, name: str, out: str | Path | None) -> Path:
     if not base.is_relative_to(target.parent):
         raise UserError(
             f"the manifest {target} must lie in {base} or in a folder above it, because its paths "
-            "may not "
-            "leave its folder; leave out --out, or move the data"
+            "may not leave its folder; leave out --out, or move the data"
         )
     if name == "real_touch" and target == base / "manifest.csv":
         raise UserError(f"{target} is the pack's own manifest; name another file with --out")
@@ -275,8 +273,7 @@ def _carry_over(
     if edits and not keep:
         raise UserError(
             f"{target} has {', '.join(edits)}, which index does not write: give another --out, "
-            "pass --keep "
-            "to carry them over by path, or remove it"
+            "pass --keep to carry them over by path, or remove it"
         )
     if edits:
         notes.append(f"kept from {target.name} by path: {', '.join(edits)}")

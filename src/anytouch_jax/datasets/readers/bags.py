@@ -91,83 +91,121 @@ def _bags(index: DatasetIndex) -> None:
             index.skip("recording that cannot be read", str(error))
 
 
+class _Streams(NamedTuple):
+    """What was read of a recording.
+
+    `times` are those of the pictures of each topic, in nanoseconds, and `exports` where they were
+    written. `series` are the values (time, value) of each label. `topics` are all topics that were
+    seen.
+    """
+
+    times: dict[str, list[int]]
+    exports: dict[str, Export]
+    series: dict[str, list[tuple[int, Any]]]
+    topics: set[str]
+
+
 def _add_recording(index: DatasetIndex, path: str, places: dict[str, tuple[str, str]]) -> None:
-    """Write the pictures of a recording, all or none, and add its rows."""
-    file = index.root / path
-    keys = index.options.keys
-    sources = sorted(one for one in file.iterdir() if one.is_file()) if file.is_dir() else [file]
-    series: dict[str, list[tuple[int, Any]]] = {name: [] for name in places}
-    wanted = {*keys, *(topic for topic, _ in places.values())} if keys else None
-    frames: dict[str, list[int]] = {}
-    counts: Counter[str] = Counter()  # of all pictures of a topic
-    topics: set[str] = set()
-    exports: dict[str, Export] = {}
+    """Write the pictures of a recording, all or none, and add its rows.
+
+    `places` are the topic and the field of each label by its name.
+    """
+    # The exports are complete when the stack closes: an error before that leaves no picture.
     with ExitStack() as stack:
-        for message in read_messages(file, wanted):
-            topics.add(message.topic)
-            for name, (topic, field) in places.items():
-                if message.topic == topic:
-                    series[name].append(
-                        (_time(message), _field(message.content, field, message.topic))
-                    )
-            if keys and message.topic not in keys:
-                continue
-            where = f"{path}, topic {message.topic}, frame {counts[message.topic]}"
-            try:
-                picture = picture_of(message)
-            except UserError as error:
-                index.leave_out(str(error), where)
-                picture = None
-                counts[message.topic] += 1
-            if picture is None:
-                continue
-            counts[message.topic] += 1
-            if message.topic not in exports:
-                folder = f"{Path(path).with_suffix('').as_posix()}/{message.topic.strip('/').replace('/', '.')}"
-                stream = f"{file.name}{message.topic}"
-                exports[message.topic] = stack.enter_context(
-                    exported(index, folder, stream, sources)
-                )
-            own = frames.setdefault(message.topic, [])
-            exports[message.topic].save(f"{len(own):06d}.png", picture)
-            own.append(_time(message))
-    if not frames:
+        streams = _read_streams(index, path, places, stack)
+    if not streams.times:
         index.skip("recording without images of the chosen topics", path)
     for name, (topic, _) in places.items():
-        if frames and topic not in topics:
-            near = difflib.get_close_matches(topic, topics, 1)
-            hint = (
-                f"; did you mean {near[0]}?" if near else f"; there are {', '.join(sorted(topics))}"
-            )
+        if streams.times and topic not in streams.topics:
+            near = difflib.get_close_matches(topic, streams.topics, 1)
+            if near:
+                hint = f"did you mean {near[0]}?"
+            else:
+                hint = f"there are {', '.join(sorted(streams.topics))}"
             index.notes.append(
-                f"{path} has no message of the topic {topic}, so label.{name} has no value{hint}"
+                f"{path} has no message of the topic {topic}, so label.{name} has no value; {hint}"
             )
-    for topic, times in frames.items():
-        stamps = np.array(times)
-        labels = {f"label.{name}": nearest_values(stamps, one) for name, one in series.items()}
-        for name, one in series.items():
-            if one and (
-                empty := [at for at, value in enumerate(labels[f"label.{name}"]) if value is None]
-            ):
-                known = np.array([time for time, _ in one])
-                away = min(float(np.abs(known - stamps[at]).min()) for at in empty) / 1e9
-                index.skip(
-                    f"frame without label.{name}: no value of {places[name][0]} within "
-                    f"{FAR / 1e9:g} s of it (the "
-                    f"nearest is {away:.3g} s away)",
-                    f"{path}, topic {topic}, frame {empty[0]}",
-                    len(empty),
-                )
+    # One recording is one group: topics of it show the same moments, so they share its split.
+    split = index.split_of(path) if streams.times else None
+    for topic, times in streams.times.items():
+        labels = {}
+        for name, series in streams.series.items():
+            values = nearest_values(np.array(times), series)
+            labels[f"label.{name}"] = values
+            where = f"{path}, topic {topic}, frame "
+            _report_far(index, name, places[name][0], where, np.array(times), series, values)
         index.add(
-            [f"{exports[topic].folder}/{at:06d}.png" for at in range(len(times))],
+            [f"{streams.exports[topic].folder}/{at:06d}.png" for at in range(len(times))],
             sensor=index.options.sensor,
             unit=topic,
             sequence=f"{path}{topic}",
             frame_index=list(range(len(times))),
             time=times,
-            split=index.split_of(path),
+            split=split,
             **labels,
         )
+
+
+def _read_streams(
+    index: DatasetIndex, path: str, places: dict[str, tuple[str, str]], stack: ExitStack
+) -> _Streams:
+    """Read a recording once: write the pictures of each topic, and keep the values of labels."""
+    file = index.root / path
+    keys = index.options.keys
+    sources = sorted(one for one in file.iterdir() if one.is_file()) if file.is_dir() else [file]
+    wanted = {*keys, *(topic for topic, _ in places.values())} if keys else None
+    counts: Counter[str] = Counter()  # of all pictures of a topic, also of those left out
+    streams = _Streams({}, {}, {name: [] for name in places}, set())
+    for message in read_messages(file, wanted):
+        streams.topics.add(message.topic)
+        for name, (topic, field) in places.items():
+            if message.topic == topic:
+                value = _field(message.content, field, message.topic)
+                streams.series[name].append((_time(message), value))
+        if keys and message.topic not in keys:
+            continue
+        where = f"{path}, topic {message.topic}, frame {counts[message.topic]}"
+        try:
+            picture = picture_of(message)
+        except UserError as error:
+            index.leave_out(str(error), where)
+            counts[message.topic] += 1
+            continue
+        if picture is None:  # a message of another kind
+            continue
+        counts[message.topic] += 1
+        if message.topic not in streams.exports:
+            topic_folder = message.topic.strip("/").replace("/", ".")
+            folder = f"{Path(path).with_suffix('').as_posix()}/{topic_folder}"
+            export = exported(index, folder, f"{file.name}{message.topic}", sources)
+            streams.exports[message.topic] = stack.enter_context(export)
+        own = streams.times.setdefault(message.topic, [])
+        streams.exports[message.topic].save(f"{len(own):06d}.png", picture)
+        own.append(_time(message))
+    return streams
+
+
+def _report_far(
+    index: DatasetIndex,
+    name: str,
+    topic: str,
+    where: str,
+    times: np.ndarray,
+    series: list[tuple[int, Any]],
+    values: list[Any],
+) -> None:
+    """Report frames that no value of a label is near to, with how far the nearest is."""
+    empty = [at for at, value in enumerate(values) if value is None]
+    if not series or not empty:
+        return
+    known = np.array([time for time, _ in series])
+    away = min(float(np.abs(known - times[at]).min()) for at in empty) / 1e9
+    index.skip(
+        f"frame without label.{name}: no value of {topic} within {FAR / 1e9:g} s of it (the "
+        f"nearest is {away:.3g} s away)",
+        f"{where}{empty[0]}",
+        len(empty),
+    )
 
 
 def nearest_values(times: np.ndarray, series: list[tuple[int, Any]]) -> list[Any]:

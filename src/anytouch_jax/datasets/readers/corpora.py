@@ -12,7 +12,7 @@ import importlib.metadata
 import re
 import zipfile
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -237,20 +237,18 @@ def _add_sample(
     key: str,
     **cells: Any,
 ) -> None:
-    """Add a row for each tactile picture of a sample; its other files are photographs, captions and
-    labels.
+    """Add a row for each tactile picture of a sample.
+
+    Its other files are RGB images, captions and labels. `fields` are the files by the end of their
+    name, with their place in the tar at `path`; `texts` those that were read as text or JSON.
+    `place` is the sequence of the sample, `key` its name, and `split` that of its tar, if stated.
     """
     pictures = {
         field: kind_of_picture(field, index.options.keys)
         for field in fields
         if f".{field.rpartition('.')[2]}" in _PICTURES
     }
-    is_named = "touch" in {pictures[field] for field in pictures if "." in field}
-    touches = [
-        field
-        for field, kind in pictures.items()
-        if kind == "touch" and ("." in field or not is_named or field in index.options.keys)
-    ]
+    touches = _touches_of(pictures, index.options.keys)
     for field in fields:
         kind = pictures.get(field)
         where = f"{path}/{key}.{field}"
@@ -258,6 +256,57 @@ def _add_sample(
             index.leave_out("picture that no word calls tactile (--keys names its field)", where)
         elif kind is None and field not in texts:
             index.skip("file of a sample that is no picture, label or text", where)
+    values, captions = _values_and_captions(texts)
+    stated = split_word(str(values.get("split"))) if split is None else None
+    if stated is not None:
+        values.pop("split")
+    obj = values.pop("object", values.pop("object_name", None))
+    labels: dict[str, Any] = {}
+    for name, value in values.items():
+        for label, (cell,) in label_cells(name, [value]).items():
+            labels[f"label.{label.removeprefix('has_')}"] = cell
+    # Reversed, so that the first picture of a kind stays.
+    others = {kind: f"{path}/{fields[field]}" for field, kind in reversed(pictures.items())}
+    if not touches:
+        index.skip("sample without a tactile picture", f"{path}/{key}")
+    has_several = len(touches) > 1
+    for field in touches:
+        unit = field.rpartition(".")[0] or None
+        index.add(
+            [f"{path}/{fields[field]}"],
+            sequence=f"{place}/{unit or field}" if has_several else place,
+            unit=unit if has_several else None,
+            frame_index=0,
+            object=None if obj is None else str(obj),
+            text=" ".join(captions) or None,
+            image_path=others.get("photo"),
+            background_path=others.get("background"),
+            split=split or stated or index.split_of(str(obj or key)),
+            **cells,
+            **labels,
+        )
+
+
+def _touches_of(pictures: Mapping[str, str], keys: Sequence[str]) -> list[str]:
+    """Return the fields of a sample that are tactile pictures.
+
+    A bare `jpg` is one where no picture with a name is: beside `gel.jpg` it is something else,
+    unless --keys names it.
+    """
+    is_named = any(kind == "touch" and "." in field for field, kind in pictures.items())
+    touches = []
+    for field, kind in pictures.items():
+        counts = "." in field or not is_named or field in keys
+        if kind == "touch" and counts:
+            touches.append(field)
+    return touches
+
+
+def _values_and_captions(texts: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
+    """Return the values of a sample by name, and its captions.
+
+    JSON gives several values. A text is a caption if it has no name or that of one.
+    """
     values: dict[str, Any] = {}
     captions = []
     for field, text in texts.items():
@@ -268,34 +317,7 @@ def _add_sample(
             captions.append(" ".join(str(text).split()))
         else:
             values[name or kind] = text
-    stated = split_word(str(values.get("split"))) if split is None else None
-    if stated is not None:
-        values.pop("split")
-    obj = values.pop("object", values.pop("object_name", None))
-    labels: dict[str, Any] = {}
-    for name, value in values.items():
-        labels |= {
-            f"label.{one.removeprefix('has_')}": cell[0]
-            for one, cell in label_cells(name, [value]).items()
-        }
-    others = {kind: f"{path}/{fields[field]}" for field, kind in reversed(pictures.items())}
-    if not touches:
-        index.skip("sample without a tactile picture", f"{path}/{key}")
-    for field in touches:
-        unit = field.rpartition(".")[0] or None
-        index.add(
-            [f"{path}/{fields[field]}"],
-            sequence=place if len(touches) == 1 else f"{place}/{unit or field}",
-            unit=unit if len(touches) > 1 else None,
-            frame_index=0,
-            object=None if obj is None else str(obj),
-            text=" ".join(captions) or None,
-            image_path=others.get("photo"),
-            background_path=others.get("background"),
-            split=split or stated or index.split_of(str(obj or key)),
-            **cells,
-            **labels,
-        )
+    return values, captions
 
 
 def kind_of_picture(field: str, keys: Sequence[str] = ()) -> str:
@@ -465,8 +487,7 @@ READERS = {
         _fota,
         "<data set>/train/data-000000.tar",
         "Zhao et al., Transferable Tactile Transformers for Representation Learning Across Diverse "
-        "Sensors and Tasks, "
-        "CoRL 2024",
+        "Sensors and Tasks, CoRL 2024",
         "MIT",
         "https://huggingface.co/datasets/alanz-mit/FoundationTactile",
         uses=("val", "test", "url", "sensor"),

@@ -82,8 +82,7 @@ def exported(
     except OSError as error:
         raise UserError(
             f"the pictures of {sources[0]} cannot be written to {index.root / folder}: "
-            f"{error.strerror or error}; make "
-            "its folder writable"
+            f"{error.strerror or error}; make its folder writable"
         ) from None
     finally:
         shutil.rmtree(part, ignore_errors=True)

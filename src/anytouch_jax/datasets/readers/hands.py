@@ -88,8 +88,7 @@ def _listed_frames(index: DatasetIndex) -> Listed:
             elif task == index.options.task:
                 raise DatasetError(
                     f"expected the list {split}{ending}.txt in "
-                    f"{index.options.lists or index.root}, or "
-                    f"in the folder of --lists; {SOURCE}"
+                    f"{index.options.lists or index.root}, or in the folder of --lists; {SOURCE}"
                 )
             else:
                 index.notes.append(f"no {split}{ending}.txt: no labels of that list")
@@ -261,44 +260,39 @@ def _tvl(index: DatasetIndex) -> None:
 def _add_part(
     index: DatasetIndex, base: str, part: str, recordings: dict[str, Sides], swapped: set[str]
 ) -> None:
+    """Add the recordings of one `data<k>` with its contact list, its captions and its backgrounds.
+
+    `recordings` are the frames of the folders tactile and vision by place. Those in `swapped` have
+    touch in the folder vision.
+    """
     contact, backgrounds = _hct_contact(index, f"{base}{part}/")
     tests, captions = index.read_captions(f"{base}{part}/", _key)
+    has_lists = bool(tests or captions)
     spare = f"{base}{part}/{SPARE}"
     default = spare if (index.root / spare).is_file() else None
-    instead = f"{SPARE} instead" if default else "kept without"
     folders = {
         place: [f"{base}{place}/{side}" for side in ("tactile", "vision")] for place in recordings
     }
-    on_disk = {  # a background may be any touch frame of this part
+    # A background may be any touch frame of this part.
+    on_disk = {
         f"{place.partition('/')[2]}/{name}": f"{folders[place][place in swapped]}/{name}"
         for place, pair in recordings.items()
         for name in pair[place in swapped].values()
     }
     contact_rows = 0
     for place, pair in recordings.items():
-        touch, vision = (0, 1) if place not in swapped else (1, 0)
+        touch, vision = (1, 0) if place in swapped else (0, 1)
         names = list(pair[touch].values())
         keys = [f"{place.partition('/')[2]}/{name}" for name in names]
         is_contact = [None if contact is None else key in contact for key in keys]
         contact_rows += sum(map(bool, is_contact))
-        splits = ["test" if key in tests else "train" for key in keys]
-        if not (tests or captions):
-            splits = [index.split_of(place)] * len(keys)
-        splits = [
-            "background" if c is False else split
-            for c, split in zip(is_contact, splits, strict=True)
-        ]
+        own_split = None if has_lists else index.split_of(place)
+        splits = []
+        for key, touched in zip(keys, is_contact, strict=True):
+            split = own_split or ("test" if key in tests else "train")
+            splits.append("background" if touched is False else split)
         named = [backgrounds.get(key, "") for key in keys]
-        lost = [
-            path
-            for path in named
-            if path and _key(path) not in on_disk and not (default and SPARE in path)
-        ]
-        index.skip(
-            f"background named and not on disk ({instead})",
-            f"{part}/{''.join(lost[:1])}",
-            len(lost),
-        )
+        _report_lost(index, part, named, on_disk, has_spare=default is not None)
         index.add(
             [f"{folders[place][touch]}/{name}" for name in names],
             sensor="digit",
@@ -308,10 +302,28 @@ def _add_part(
             image_path=index.photographs(folders[place][vision], names, set(pair[vision].values())),
             background_path=[on_disk.get(_key(path), default) for path in named],
             text=[captions.get(key) for key in keys],
-            **{"label.contact": [None if c is None else int(c) for c in is_contact]},
+            **{"label.contact": [None if one is None else int(one) for one in is_contact]},
         )
     missing = len(contact) - contact_rows if contact else 0
     index.skip("listed contact frame that is not on disk", f"{base}{part}", missing)
+
+
+def _report_lost(
+    index: DatasetIndex, part: str, named: list[str], on_disk: dict[str, str], *, has_spare: bool
+) -> None:
+    """Report backgrounds that a contact list names and that are not on disk.
+
+    The picture for the whole part (SPARE) takes their place where it is there, and is named itself
+    by frames without a background.
+    """
+    lost = []
+    for path in named:
+        is_spare = has_spare and SPARE in path
+        if path and _key(path) not in on_disk and not is_spare:
+            lost.append(path)
+    instead = f"{SPARE} instead" if has_spare else "kept without"
+    first = lost[0] if lost else ""
+    index.skip(f"background named and not on disk ({instead})", f"{part}/{first}", len(lost))
 
 
 def _key(path: str) -> str:
@@ -540,8 +552,7 @@ READERS = {
         _tacquad,
         "data_indoor/<item>/gelsight/0.png",
         "Feng et al., AnyTouch: Learning Unified Static-Dynamic Representation across Multiple "
-        "Visuo-tactile Sensors, "
-        "ICLR 2025",
+        "Visuo-tactile Sensors, ICLR 2025",
         url="https://huggingface.co/datasets/xxuan01/TacQuad",
         uses=("val", "test", "lists"),
         paper=55_082,

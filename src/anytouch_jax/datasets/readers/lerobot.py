@@ -12,7 +12,7 @@ import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -26,110 +26,131 @@ from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_path
 
 
+class _Dataset(NamedTuple):
+    """What meta/info.json states, and what was asked for of it.
+
+    `features` and `cameras` are by LeRobot's names. `keys` are the cameras that are indexed, and
+    `videos` those of them that are stored as videos.
+    """
+
+    info: dict[str, Any]
+    features: dict[str, dict[str, Any]]
+    cameras: list[str]
+    keys: tuple[str, ...]
+    videos: list[str]
+
+
 def _lerobot(index: DatasetIndex) -> None:
-    """A LeRobotDataset v3, a sequence for each tactile camera of an episode; films become PNG by
-    LeRobot's names.
+    """Index a LeRobotDataset v3: a sequence for each tactile camera of an episode.
+
+    Frames of videos become PNG under LeRobot's names. Raises DatasetError.
     """
     if not (index.root / "meta" / "info.json").is_file():
         return
-    info = common.read_json(index.root / "meta" / "info.json")
     sensor = index.need_sensor()
-    if not str(info.get("codebase_version", "")).startswith("v3"):
+    dataset = _read_info(index)
+    episodes = {int(row["episode_index"]): row for row in _parquet_rows(index, "meta/episodes/")}
+    splits = _stated_splits(index, dataset.info, episodes)
+    folders = {key: _export_films(index, dataset.info, key, episodes) for key in dataset.videos}
+    rows_of, labels = _read_rows(index, dataset)
+    first = 0
+    for path, rows in rows_of.items():
+        here = {name: values[first : first + len(rows)] for name, values in labels.items()}
+        first += len(rows)
+        episode = [int(row["episode_index"]) for row in rows]
+        frame = [int(row["frame_index"]) for row in rows]
+        unstated = sum(number not in splits for number in episode)
+        index.skip("frame of an episode in no stated split (split unused)", path, unstated)
+        for key in dataset.keys:
+            if key in folders:
+                paths = [
+                    f"{folders[key][number]}/frame-{at:06d}.png"
+                    for number, at in zip(episode, frame, strict=True)
+                ]
+            else:  # the pictures are cells of the table
+                paths = [f"{path}/{key}/{at}" for at in range(len(rows))]
+            index.add(
+                paths,
+                sensor=sensor,
+                unit=key,
+                sequence=[f"episode-{number:06d}/{key}" for number in episode],
+                frame_index=frame,
+                split=[splits.get(number, "unused") for number in episode],
+                episode=episode,
+                index=[int(row["index"]) for row in rows],
+                timestamp=[float(row["timestamp"]) for row in rows],
+                **here,
+            )
+
+
+def _read_info(index: DatasetIndex) -> _Dataset:
+    """Return what meta/info.json states of the cameras that were asked for.
+
+    Raises DatasetError for another version, and for a camera or a feature that is not there.
+    """
+    info = common.read_json(index.root / "meta" / "info.json")
+    version = str(info.get("codebase_version", ""))
+    if not version.startswith("v3"):
         raise DatasetError(
             f"{index.root} has version {info.get('codebase_version')} of LeRobot's format; convert "
-            "it to v3.0 with "
-            "LeRobot's script"
+            "it to v3.0 with LeRobot's script"
         )
     features = {
-        str(name): one
-        for name, one in dict(info.get("features", {})).items()
-        if isinstance(one, dict)
+        str(name): feature
+        for name, feature in dict(info.get("features", {})).items()
+        if isinstance(feature, dict)
     }
     cameras = [name for name, one in features.items() if one.get("dtype") in ("image", "video")]
     keys = index.options.keys or tuple(name for name in cameras if common.TACTILE.search(name))
-    if unknown := [key for key in keys if key not in cameras] or ([] if keys else [""]):
-        wrong = f"there is no camera {unknown[0]}" if unknown[0] else "no camera is called tactile"
+    unknown = [key for key in keys if key not in cameras]
+    if unknown or not keys:
+        wrong = f"there is no camera {unknown[0]}" if unknown else "no camera is called tactile"
         raise DatasetError(f"{index.root}: {wrong}; choose with --keys from {', '.join(cameras)}")
-    episodes = {int(row["episode_index"]): row for row in _parquet_rows(index, "meta/episodes/")}
-    tasks = _tasks(index)
-    splits = _stated_splits(index, info, episodes)
-    films = [key for key in keys if features[key]["dtype"] == "video"]
-    folders = {key: _export_films(index, info, key, episodes) for key in films}
-    wanted = [
-        "episode_index",
-        "frame_index",
-        "timestamp",
-        "index",
-        "task_index",
-        *index.options.values,
-    ]
     for name in index.options.values:
         if name not in features:
             raise DatasetError(f"{index.root} has no feature {name}; it has {', '.join(features)}")
-    files = [
-        (path, set(pa.parquet.read_schema(index.root / path).names))
+    videos = [key for key in keys if features[key]["dtype"] == "video"]
+    return _Dataset(info, features, cameras, keys, videos)
+
+
+def _read_rows(
+    index: DatasetIndex, dataset: _Dataset
+) -> tuple[dict[str, list[dict[str, Any]]], dict[str, list[Any]]]:
+    """Return the rows of each table below data/, and the labels of all rows in that order.
+
+    A label is a value that --values names, or the sentence of the task. Features that nobody asked
+    for are named in a note.
+    """
+    values = index.options.values
+    wanted = ["episode_index", "frame_index", "timestamp", "index", "task_index", *values]
+    columns_of = {
+        path: set(pa.parquet.read_schema(index.root / path).names)
         for path in index.paths(".parquet", "data/")
-    ]
-    for name in index.options.values:
-        index.skip_all(
-            f"file without the column {name}",
-            [path for path, columns in files if name not in columns],
-        )
-    rows_of = {
-        path: pa.parquet.read_table(
-            index.root / path, columns=[one for one in wanted if one in columns]
-        ).to_pylist()
-        for path, columns in files
     }
-    cells = {
-        name: common.label_cells(name, [row.get(name) for rows in rows_of.values() for row in rows])
-        for name in index.options.values
-    }
-    index.wanted += [f"label.{label}" for names in cells.values() for label in names]
-    others = [name for name in features if name not in (*cameras, *wanted)]
+    for name in values:
+        without = [path for path, columns in columns_of.items() if name not in columns]
+        index.skip_all(f"file without the column {name}", without)
+    rows_of = {}
+    for path, columns in columns_of.items():
+        present = [name for name in wanted if name in columns]
+        rows_of[path] = pa.parquet.read_table(index.root / path, columns=present).to_pylist()
+    all_rows = [row for rows in rows_of.values() for row in rows]
+    labels: dict[str, list[Any]] = {}
+    # One call a name over all rows, because the type of a label is that of all its values.
+    for name in values:
+        for label, cells in common.label_cells(name, [row.get(name) for row in all_rows]).items():
+            labels[f"label.{label}"] = cells
+    index.wanted += labels
+    tasks = _tasks(index)
+    if tasks:
+        labels["label.task"] = [tasks.get(row.get("task_index")) for row in all_rows]
+    others = [name for name in dataset.features if name not in (*dataset.cameras, *wanted)]
     if others:
         index.notes.append(
             f"features that are not read: {', '.join(others)}; --values makes labels of those it "
             "names"
         )
-    first = 0
-    for path, rows in rows_of.items():
-        labels = {
-            f"label.{label}": values[first : first + len(rows)]
-            for names in cells.values()
-            for label, values in names.items()
-        }
-        first += len(rows)
-        labels |= (
-            {"label.task": [tasks.get(row.get("task_index")) for row in rows]} if tasks else {}
-        )
-        episode, frame = (
-            [int(row[name]) for row in rows] for name in ("episode_index", "frame_index")
-        )
-        index.skip(
-            "frame of an episode in no stated split (split unused)",
-            path,
-            sum(e not in splits for e in episode),
-        )
-        for key in keys:
-            paths = [f"{path}/{key}/{at}" for at in range(len(rows))]
-            if key in films:
-                paths = [
-                    f"{folders[key][e]}/frame-{f:06d}.png"
-                    for e, f in zip(episode, frame, strict=True)
-                ]
-            index.add(
-                paths,
-                sensor=sensor,
-                unit=key,
-                sequence=[f"episode-{e:06d}/{key}" for e in episode],
-                frame_index=frame,
-                split=[splits.get(e, "unused") for e in episode],
-                episode=episode,
-                index=[int(row["index"]) for row in rows],
-                timestamp=[float(row["timestamp"]) for row in rows],
-                **labels,
-            )
+    return rows_of, labels
 
 
 def _stated_splits(
@@ -145,8 +166,7 @@ def _stated_splits(
         if splits and index.options.val + index.options.test:
             index.notes.append(
                 f"meta/info.json states split {next(iter(splits))} alone, so episodes are split by "
-                "hash; --val 0 "
-                "--test 0 keeps all in train"
+                "hash; --val 0 --test 0 keeps all in train"
             )
         return {number: index.split_of(f"episode-{number:06d}") for number in episodes}
     for name, ranges in splits.items():

@@ -145,32 +145,13 @@ def read(index: DatasetIndex) -> None:
 
 
 def _films(index: DatasetIndex, recordings: list[_Recording]) -> list[bool]:
-    """Return which recordings are films, by names, or by a few pictures if objects have one folder;
-    order them.
+    """Return which recordings are videos as pictures, and put their names into order.
+
+    Names decide, or a few pictures where every object has one folder. --singles, --films and
+    --order times decide for all.
     """
     options = index.options
-    unclear = list[str]()
-    films = [options.films or options.order == "times"] * len(recordings)
-    for at, one in enumerate(recordings):
-        one.names[:], is_clear = frame_order(one.names)
-        if options.order == "times":
-            times = {
-                name: os.stat(index.root / one.folder / name).st_mtime_ns for name in one.names
-            }
-            one.names.sort(key=times.__getitem__)
-            is_clear = len(set(times.values())) == len(times)
-        films[at] = not options.singles and (
-            films[at] or looks_like_film(one.names) or len(one.names) == 1
-        )
-        if films[at] and not is_clear:
-            unclear.append(one.folder or ".")
-    if unclear:
-        what = "times of the files" if options.order == "times" else "names"
-        advice = "" if options.order == "times" else "; --order times takes the times of the files"
-        index.notes.append(
-            f"the {what} do not order {len(unclear)} recordings clearly (first: "
-            f"{unclear[0]}){advice}"
-        )
+    films = _films_by_names(index, recordings)
     if options.singles or options.films or options.order == "times":
         return films
     several = [at for at, one in enumerate(recordings) if films[at] and len(one.names) > 1]
@@ -178,25 +159,66 @@ def _films(index: DatasetIndex, recordings: list[_Recording]) -> list[bool]:
         (recordings[at].place.split, recordings[at].place.object, recordings[at].unit)
         for at in several
     ]
+    # Where each object has one folder, its pictures may as well be single touches with numbers for
+    # names, so a few of them are opened.
     if len(set(objects)) == len(objects):
-        spread = np.unique(np.linspace(0, len(several) - 1, min(8, len(several))).astype(int))
-        chosen = [recordings[several[at]] for at in spread]
-        if not _moves_like_film(
-            [[index.root / one.folder / name for name in one.names] for one in chosen]
-        ):
+        if not _move_like_films(index, [recordings[at] for at in several]):
             films = [is_film and at not in several for at, is_film in enumerate(films)]
-        elif len({one for _, one, _ in objects}) > 1:
+        elif len({name for _, name, _ in objects}) > 1:
             index.notes.append(
                 "each object has one recording; if its pictures are single touches, give --singles"
             )
-    if alone := [one.folder for one, is_film in zip(recordings, films, strict=True) if not is_film]:
+    alone = [one.folder for one, is_film in zip(recordings, films, strict=True) if not is_film]
+    if alone:
         where = f"{len(alone)} folders (first: {alone[0] or '.'})"
         index.notes.append(
             f"the pictures of {where} do not look like a film: each is a single touch; --films "
-            "makes a recording of "
-            "each folder"
+            "makes a recording of each folder"
         )
     return films
+
+
+def _films_by_names(index: DatasetIndex, recordings: list[_Recording]) -> list[bool]:
+    """Return which recordings are videos by the names of their pictures, which are put into order.
+
+    A note says where neither names nor times of files give an order.
+    """
+    options = index.options
+    by_time = options.order == "times"
+    films = []
+    unclear = []
+    for one in recordings:
+        one.names[:], is_clear = frame_order(one.names)
+        if by_time:
+            files = [index.root / one.folder / name for name in one.names]
+            times = {file.name: os.stat(file).st_mtime_ns for file in files}
+            one.names.sort(key=times.__getitem__)
+            is_clear = len(set(times.values())) == len(times)
+        looks_like_one = looks_like_film(one.names) or len(one.names) == 1
+        is_film = not options.singles and (options.films or by_time or looks_like_one)
+        films.append(is_film)
+        if is_film and not is_clear:
+            unclear.append(one.folder or ".")
+    if unclear:
+        what = "times of the files" if by_time else "names"
+        advice = "" if by_time else "; --order times takes the times of the files"
+        index.notes.append(
+            f"the {what} do not order {len(unclear)} recordings clearly (first: "
+            f"{unclear[0]}){advice}"
+        )
+    return films
+
+
+def _move_like_films(index: DatasetIndex, recordings: list[_Recording]) -> bool:
+    """Return whether pictures change as a video does, in at most eight recordings."""
+    count = len(recordings)
+    spread = np.unique(np.linspace(0, count - 1, min(8, count)).astype(int))
+    return _moves_like_film(
+        [
+            [index.root / recordings[at].folder / name for name in recordings[at].names]
+            for at in spread
+        ]
+    )
 
 
 def ranked_split(groups: Iterable[str], options: common.IndexOptions) -> dict[str, str]:

@@ -488,7 +488,9 @@ def export_grasps(root: Path, names: Sequence[str]) -> int:
     try:
         import h5py  # type: ignore[import-not-found, unused-ignore]
     except ImportError:
-        raise DatasetError("the original files of Feel are HDF5; run pip install h5py") from None
+        raise DatasetError(
+            'the original files of Feel are HDF5; run pip install "anytouch_jax[hdf5]"'
+        ) from None
     lines: list[list[Any]] = []
     numbers: dict[str, int] = {}
     for name in tracked(sorted(names, key=natural), "files read"):

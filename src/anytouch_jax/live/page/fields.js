@@ -2,7 +2,8 @@
 // What was measured: the surface of the gel, which can be turned, and force and depth as a bar and in words.
 
 const VIEW = [640, 440], LIFT = 0.25; // pixels of the view; height of the deepest place, in widths of the picture
-const REACH = { "force, N": [0, 1], "depth, mm": [0, 0.2], "depth, widths": [0, 0.01], slip: [0, 1] }; // of their curves at least
+const REACH = { "contact, %": [0, 5], "force, N": [0, 1], "depth, mm": [0, 0.2], "depth, widths": [0, 0.01], "slip, %": [0, 100] }; // of their curves at least
+const INFERNO = ["#000004", "#420a68", "#932667", "#dd513a", "#fca50a", "#fcffa4"]; // of depth, from none to the deepest
 const turned = { about: -0.5, tilt: 0.95 }; // radians, for all surfaces
 
 // Heights from a grey picture. They are smoothed, as its 256 steps are no edges.
@@ -65,6 +66,11 @@ function drawSurface(canvas) {
 
 // A layer on the canvas of a stage. A surface is turned by dragging and by the arrow keys.
 function showLayer(canvas, bitmap, isSurface) {
+  if (!isSurface) { // numbers and curves stand beside a picture that is higher than wide
+    const look = canvas.closest(".look");
+    look?.classList.toggle("portrait", bitmap.height > 1.1 * bitmap.width);
+    look?.style.setProperty("--wide", bitmap.width / bitmap.height);
+  }
   canvas.surface = isSurface ? heightsOf(bitmap) : null;
   canvas.tabIndex = isSurface ? 0 : -1;
   canvas.dataset.own = isSurface ? Object.keys(ARROWS) : "";
@@ -92,11 +98,19 @@ const stage = (canvas) => {
 function forceBar() {
   const bar = el("i", { className: "ours" }), value = el("span"), words = el("p", { className: "soft small" }), fault = el("p", { className: "soft small" });
   const bars = el("div", { className: "bars small" }, el("span", {}, "force"), el("span", { className: "track" }, bar), value);
-  const node = el("div", { className: "force" }, bars, words, fault);
+  const ramp = el("canvas", { width: 120, height: 10, role: "img", ariaLabel: "colours from no depth to the deepest" }), deepest = el("span");
+  const scale = el("p", { className: "scale small" }, el("span", {}, "depth 0"), ramp, deepest);
+  const node = el("div", { className: "force" }, bars, words, scale, fault);
+  const g = ramp.getContext("2d"), colours = g.createLinearGradient(0, 0, 120, 0);
+  INFERNO.forEach((colour, i) => colours.addColorStop(i / (INFERNO.length - 1), colour));
+  g.fillStyle = colours;
+  g.fillRect(0, 0, 120, 10);
   let most = 10; // N of a whole bar
-  const show = (one, isSurface = false) => {
+  const show = (one, layer = "frame") => {
     node.hidden = !one;
     if (!one) return;
+    scale.hidden = layer !== "depth";
+    deepest.textContent = `${one.scale.toFixed(one.unit === "mm" ? 2 : 4)} ${one.unit}`;
     bars.hidden = !one.force;
     const part = [], off = (number, std, digits) => `${number.toFixed(digits)} ± ${std.toFixed(digits)}`;
     if (one.force) {
@@ -109,7 +123,7 @@ function forceBar() {
     }
     part.push(`depth ${off(one.depth, one.depth_std, one.unit === "mm" ? 2 : 4)} ${one.unit}`);
     part.push(one.unit === "mm" ? `contact ${one.area.toFixed(0)} mm²` : "no mm and N, since the sensor is not known");
-    if (isSurface) part.push(`heights are drawn ${(LIFT / one.high).toPrecision(2)} times as high`);
+    if (layer === "surface") part.push(`heights are drawn ${(LIFT / one.high).toPrecision(2)} times as high`);
     words.textContent = part.join(", ");
     fault.textContent = one.faults.length ? `Do not trust these values: ${one.faults.join(" ")}` : "";
   };

@@ -101,24 +101,44 @@ function showLive(source, about) {
     if (scores[name].length > KEPT_LIVE) scores[name].shift();
     return () => {
       const at = 3 * Object.keys(scores).indexOf(name);
-      chart(curves.children[at + 1], [{ values: scores[name], colour: accent() }], { level, reach: REACH[name], length: KEPT_LIVE });
-      curves.children[at + 2].textContent = shortened(value);
+      const unit = unitOf(name);
+      chart(curves.children[at + 1], [{ values: scores[name], colour: accent() }], { level, reach: REACH[name], length: KEPT_LIVE, unit });
+      curves.children[at + 2].textContent = shortened(value, unit);
     };
   };
+  // What is not known of a frame, such as slip where nothing touches, is a gap in its curve.
+  const curvesOf = (one) => {
+    const { contact, ...others } = one.curves, found = Object.fromEntries(Object.keys(scores).map((name) => [name, null]));
+    if (contact !== undefined) found[CONTACT] = inPercent(contact);
+    return { ...found, ...others };
+  };
   const feel = (one) => {
-    const known = about.head || trained, bar = el("i", { className: "ours" });
+    const known = about.head || trained;
     feels.hidden = !known && one.contact === null;
-    sure.hidden = nearest.hidden = !known || one.contact === false || one.label === undefined;
-    if (!known) { felt.textContent = one.contact === null ? "" : one.contact ? "● Contact" : "○ No contact"; why.textContent = ""; return; }
-    if (one.contact === false) { felt.textContent = "○ No contact"; why.textContent = ""; return; }
+    const named = known && one.contact !== false && one.label !== undefined;
+    feels.classList.toggle("novel", Boolean(named && one.novel));
+    sure.hidden = !named || one.novel;
+    nearest.hidden = !named;
+    why.textContent = "";
+    if (!known && one.contact === null) { felt.textContent = ""; return; }
+    if (!known || one.contact === false) { felt.textContent = one.contact ? "● Contact" : "○ No contact"; return; }
     if (one.label === undefined) return;
-    felt.textContent = one.label;
-    bar.style.width = `${100 * one.p}%`;
-    sure.replaceChildren(el("span", {}, "probability"), el("span", { className: "track" }, bar), el("span", {}, percent(one.p)));
-    const possible = one.set?.length === 1 ? "" : one.set?.length ? `It may be ${one.set.slice(0, 4).join(", ")}. ` : "No name is likely enough. ";
-    why.textContent = one.novelty === undefined ? "" : one.novel ? `Unlike every recording. ${one.set ? "" : possible}` : one.set ? possible : "";
     fact("novelty", one.novelty === undefined ? "unknown" : `${one.novelty}${one.limit ? ` (limit ${one.limit})` : ""}`, one.novel ? "bad" : "");
     fact("possible names", one.set ? one.set.slice(0, 4).join(", ") || "none" : "unknown");
+    // Something new is a state of its own. A bar would say how sure the head is of a name that it does not have.
+    if (one.novel) {
+      felt.textContent = "Something new";
+      why.textContent = `Unlike every recording. The nearest name is ${one.recorded?.[0]?.about.object ?? one.label}.`;
+      return;
+    }
+    felt.textContent = one.label;
+    const bar = el("i", { className: "ours" });
+    bar.style.width = `${100 * one.p}%`;
+    sure.replaceChildren(el("span", {}, "probability"), el("span", { className: "track" }, bar), el("span", {}, percent(one.p)));
+    if (one.set === undefined) return;
+    if (one.limit === null) why.textContent = `From ${one.recordings} recordings it cannot tell what is new. Record more: nine can.`;
+    else if (!one.set.length) why.textContent = "No name is likely enough.";
+    else if (one.set.length > 1) why.textContent = `It may be ${one.set.slice(0, 4).join(", ")}.`;
   };
   const percentile = (values, share) => [...values].sort((a, b) => a - b)[Math.floor(share * (values.length - 1))] ?? 0;
   const show = async (one, jpeg) => {
@@ -129,7 +149,7 @@ function showLive(source, about) {
     const age = performance.timeOrigin + performance.now() - one.grabbed;
     ages.push(age);
     if (ages.length > 600) ages.shift();
-    const draws = Object.entries(one.curves).map(([name, value]) => curve(name, value, name === "contact" ? one.threshold : null));
+    const draws = Object.entries(curvesOf(one)).map(([name, value]) => curve(name, value, name === CONTACT ? inPercent(one.threshold) : null));
     main.dataset.frames = Number(main.dataset.frames ?? 0) + 1;
     if (one.taught !== taught) { taught = one.taught; learn(); }
     recording = one.recording.on;
@@ -137,7 +157,7 @@ function showLive(source, about) {
     main.dataset.ages = JSON.stringify([percentile(ages, 0.5), percentile(ages, 0.99), Math.max(...ages)].map(Math.round));
     draws.forEach((draw) => draw());
     feel(one);
-    force.show(one.fields, one.layer === "surface");
+    force.show(one.fields, one.layer);
     hidden.hidden = one.layer === state.layer;
     record.textContent = recording ? `Recording ${one.recording.name}: ${one.recording.written} frames` : "Hold to record";
     record.classList.toggle("on", recording);
@@ -191,18 +211,19 @@ function showLive(source, about) {
   const layers = layerBar(about.layers, read);
   const hidden = el("span", { className: "soft", hidden: true }, "The untouched gel is not known yet, so the picture is shown.");
   const background = el("button", { onclick: () => send({ do: "background" }) }, "Capture the untouched gel");
-  const feels = el("section", { className: "card", hidden: true }, felt, sure, why, nearest);
-  const panel = el("div", { className: "column" }, feels,
-    el("section", { className: "card" }, el("h3", {}, "Teach it a touch"), el("label", { className: "tall" }, "name of what you touch", object), known, record, names,
-      missing, train, result, downloads));
+  const feels = el("section", { className: "card feels", hidden: true }, felt, sure, why, nearest);
+  // On a phone this bar stays at the bottom, under the thumb.
+  const recordBar = el("div", { className: "recordbar" }, el("label", { className: "tall" }, "name of what you touch", object), record);
+  const teach = el("section", { className: "card teach" }, el("h3", {}, "Teach it a touch"), known, recordBar, names, missing, train, result, downloads);
   const more = el("details", {}, el("summary", {}, "Camera and latency"), el("div", { className: "column" }, el("div", { className: "bar" },
     option("rotate", [0, 90, 180, 270].map((angle) => [angle, `${angle}°`]), 0, (value) => { view.rotate = value; turn(); }),
     option("flip", [["none", "none"], ["across", "left-right"], ["down", "top-bottom"]], "none", (value) => { view.flip = value; turn(); }),
     background, el("button", { onclick: () => send({ do: "no background" }) }, "Estimate it again")), facts));
-  main.replaceChildren(el("div", { className: "split live" },
-    el("div", { className: "column" }, el("div", { className: "bar" }, el("h2", {}, state.sources[source].name), el("div", { className: "push" }, layers.node)),
-      stage(canvas), hidden, force.node, curves, el("h3", { hidden: about.table === null }, "Nearest known touches"), near),
-    panel), more);
+  const picture = el("div", { className: "look" }, el("div", { className: "column" }, stage(canvas), hidden), el("div", { className: "column" }, force.node, curves));
+  main.replaceChildren(el("div", { className: "split live" }, feels,
+    el("div", { className: "column shown" }, el("div", { className: "bar" }, el("h2", {}, state.sources[source].name), el("div", { className: "push" }, layers.node)),
+      picture, el("h3", { hidden: about.table === null }, "Nearest known touches"), near),
+    teach), more);
   keys([["r", "hold to record", () => { if (!state.repeated) begin(); }], ["l", "next layer", layers.next], ["b", "capture the untouched gel", () => background.click()]]);
   document.addEventListener("keyup", lifted);
   window.addEventListener("pagehide", leave);

@@ -137,12 +137,22 @@ async function picture(path, alt) {
   return image;
 }
 
+// Contact is a change of the picture in grey levels, of which there are 255.
+const CONTACT = "contact, %";
+const inPercent = (levels) => (levels === null || levels === undefined ? null : levels / 2.55);
+
 // ---- charts ------------------------------------------------------------------------------------------------------
 
-// lines: [{values: [y or null], x: [x] or nothing, colour, dash}]; mark: x of a vertical line; level: y of a limit;
-// reach: values that the axis shows at least.
+// Numbers of one axis have the same decimals: as many as its range needs.
+const decimalsOf = (range) => Math.min(4, Math.max(0, Math.ceil(1 - Math.log10(Math.max(range, 1e-9)))));
+// The unit stands behind the comma of a name, such as "force, N".
+const unitOf = (name) => name.split(", ")[1] ?? "";
+const within = (value) => value !== null && value !== undefined;
+
+// lines: [{values: [y or null], x: [x] or nothing, colour, dash, faint}]; mark: x of a vertical line; level: y of a limit;
+// reach: values that the axis shows at least; unit: of y. Where a value is null, the line has a gap.
 // With a `length` in frames the chart has the time axis of a slider, and its numbers lie inside.
-function chart(canvas, lines, { mark = null, level = null, reach = [], log = false, length = 0 } = {}) {
+function chart(canvas, lines, { mark = null, level = null, reach = [], log = false, length = 0, unit = "" } = {}) {
   const ratio = window.devicePixelRatio || 1, width = canvas.clientWidth, height = canvas.clientHeight;
   if (!width) return;
   canvas.width = width * ratio;
@@ -150,20 +160,22 @@ function chart(canvas, lines, { mark = null, level = null, reach = [], log = fal
   const g = canvas.getContext("2d"), style = getComputedStyle(document.body);
   g.scale(ratio, ratio);
   const y = (value) => (log ? Math.log10(Math.max(value, 1e-9)) : value);
-  const every = lines.flatMap((line) => line.values.filter((value) => value !== null).map(y));
+  const every = lines.flatMap((line) => line.values.filter(within).map(y));
   if (!every.length) return;
   every.push(...(level === null ? reach : [...reach, level]).map(y));
   let low = every.reduce((a, b) => Math.min(a, b)), high = every.reduce((a, b) => Math.max(a, b));
   if (high - low < 1e-9) { low -= 0.5; high += 0.5; }
+  const room = 0.12 * (high - low); // above and below the curve
   const at = (line, i) => (line.x ? line.x[i] : i);
   const right = length ? Math.max(1, length - 1) : Math.max(1, ...lines.map((line) => at(line, line.values.length - 1) ?? 0));
   const left = lines.every((line) => line.x) ? Math.min(...lines.map((line) => line.x[0] ?? right)) : 0;
-  const inset = length ? 8 : 44, foot = length ? 5 : 15; // 8: half the thumb of a slider
+  const inset = length ? 8 : 52, foot = length ? 5 : 15; // 8: half the thumb of a slider
   const px = (x) => inset + ((width - inset - 8) * (x - left)) / Math.max(right - left, 1e-9);
-  const py = (value) => 5 + (height - 5 - foot) * (1 - (value - low) / (high - low));
+  const py = (value) => 5 + (height - 5 - foot) * (1 - (value - low + room) / (high - low + 2 * room));
+  const decimals = decimalsOf(high - low);
   const text = (value) => {
-    const number = log ? 10 ** value : value;
-    return number && Math.abs(number) < 0.01 ? number.toExponential(0) : Number(number.toPrecision(2)).toString();
+    const number = log ? 10 ** value : value, shown = log ? Number(number.toPrecision(2)).toString() : number.toFixed(decimals);
+    return unit ? `${shown} ${unit}` : shown;
   };
   g.strokeStyle = style.getPropertyValue("--line");
   g.strokeRect(inset, 5, width - inset - 8, height - 5 - foot);
@@ -171,29 +183,40 @@ function chart(canvas, lines, { mark = null, level = null, reach = [], log = fal
     g.strokeStyle = colour;
     g.setLineDash(dash);
     g.beginPath();
-    points.forEach((point, i) => (i ? g.lineTo(...point) : g.moveTo(...point)));
+    let begun = false;
+    for (const point of points) {
+      if (point && begun) g.lineTo(...point); else if (point) g.moveTo(...point);
+      begun = Boolean(point);
+    }
     g.stroke();
     g.setLineDash([]);
   };
   if (level !== null) stroke(style.getPropertyValue("--soft"), [[inset, py(y(level))], [width - 8, py(y(level))]], [4, 4]);
   for (const line of lines) {
-    const points = line.values.map((value, i) => (value === null ? null : [px(at(line, i)), py(y(value))]));
-    const drawn = points.filter((point) => point);
+    const points = line.values.map((value, i) => (within(value) ? [px(at(line, i)), py(y(value))] : null));
     g.lineWidth = 1.5;
-    stroke(line.colour, drawn, line.dash);
-    if (drawn.length === 1) { g.fillStyle = line.colour; g.fillRect(drawn[0][0] - 2, drawn[0][1] - 2, 4, 4); }
+    g.globalAlpha = line.faint ? 0.3 : 1;
+    stroke(line.colour, points, line.dash);
+    g.fillStyle = line.colour;
+    // A value between two gaps has no line.
+    points.forEach((point, i) => { if (point && !points[i - 1] && !points[i + 1]) g.fillRect(point[0] - 2, point[1] - 2, 4, 4); });
+    g.globalAlpha = 1;
   }
   if (mark !== null) stroke(style.getPropertyValue("--text"), [[px(mark), 5], [px(mark), height - foot]]);
   g.font = "12px system-ui, sans-serif";
   g.fillStyle = style.getPropertyValue("--soft");
   g.textAlign = length ? "left" : "right";
+  g.textBaseline = "middle";
   g.strokeStyle = style.backgroundColor;
   g.lineWidth = 4;
   for (const draw of ["strokeText", "fillText"]) { // numbers can be read on top of a line
-    g[draw](text(high), length ? 12 : 40, 16);
-    g[draw](text(low), length ? 12 : 40, height - (length ? 9 : 15));
+    g[draw](text(high), length ? 12 : 48, Math.max(12, py(high)));
+    g[draw](text(low), length ? 12 : 48, Math.min(height - foot - 7, py(low)));
   }
-  if (!length) g.fillText(String(right), width - 8, height - 2);
+  if (!length) {
+    g.textBaseline = "alphabetic";
+    g.fillText(String(right), width - 8, height - 2);
+  }
 }
 
 function swatch(colour, dash) {
@@ -232,8 +255,9 @@ function describe(clip, title) {
 function clipCard(source, clip, pictures, title) {
   const canvas = el("canvas", { role: "img", ariaLabel: `touch by ${clip.sensor ?? "this sensor"}` });
   const contact = el("span", { className: "soft" }), scores = clip.rows.map(() => null), force = forceBar(), measured = {};
+  const words = el("div", { className: "column" }, force.node, describe(clip, title));
   const node = el("section", { className: "clip" }, stage(canvas),
-    el("div", { className: "bar" }, clip.sensor ? el("h3", {}, clip.sensor) : null, contact), force.node, describe(clip, title));
+    el("div", { className: "bar" }, clip.sensor ? el("h3", {}, clip.sensor) : null, contact), words);
   if (clip.photo) {
     guard(async () => {
       const image = await picture(`${source}/photo/${clip.rows[0]}`, "photograph of the object");
@@ -251,14 +275,19 @@ function clipCard(source, clip, pictures, title) {
     for (let next = t + 1; next <= Math.min(t + AHEAD, clip.rows.length - 1); next++) pictures.get(clip.rows[next]);
     const one = await load(t), score = one.score ?? null;
     if (one.bitmap) showLayer(canvas, one.bitmap, one.isSurface);
-    force.show(one.fields, one.isSurface);
+    force.show(one.fields, one.isSurface ? "surface" : state.layer);
     contact.textContent = one.error ?? (score === null ? (clip.rows.length > 1 ? "\u00a0" : "") : score > clip.threshold ? "● contact" : "○ no contact");
   };
-  return { node, clip, scores, measured, load, show };
+  return { node, words, clip, scores, measured, load, show };
 }
 
-const shortened = (number) => (number === null || number === undefined ? ""
-  : number && Math.abs(number) < 0.01 ? number.toExponential(1) : Number(number.toPrecision(3)).toString());
+// A value beside its curve, with the decimals that the reach of the curve needs.
+const DECIMALS = { N: 2, mm: 2, widths: 4, "%": 1 };
+const shortened = (number, unit) => {
+  if (number === null || number === undefined) return "";
+  const shown = unit in DECIMALS ? number.toFixed(DECIMALS[unit]) : Number(number.toPrecision(3)).toString();
+  return unit ? `${shown} ${unit}` : shown;
+};
 
 // One time axis: the slider, and a curve below it for everything that was measured.
 function timeline(cards, length, seek) {
@@ -272,17 +301,19 @@ function timeline(cards, length, seek) {
     const point = (event) => { if (event.buttons) seek(Math.round(((event.offsetX - 8) / (canvas.clientWidth - 16)) * (length - 1))); };
     canvas.addEventListener("pointerdown", point);
     canvas.addEventListener("pointermove", point);
+    const unit = unitOf(name);
     const parts = [el("span", { className: "soft" }, name.replaceAll("_", " ")), canvas, now];
     curves.append(...parts);
     rows.push((t) => {
       const lines = cards.map((one, i) => ({ values: of(one), ...looks(i) }));
       parts.forEach((part) => { part.hidden = lines.every((line) => line.values.every((each) => each === null)); });
       if (parts[0].hidden) return;
-      chart(canvas, lines, { mark: t, level, reach, length });
-      now.textContent = lines.map((line) => shortened(line.values[Math.min(t, line.values.length - 1)])).join("\n");
+      chart(canvas, lines, { mark: t, level, reach, length, unit });
+      now.textContent = lines.map((line) => shortened(line.values[Math.min(t, line.values.length - 1)], unit)).join("\n");
     });
   };
-  addRow(seen, "contact", (one) => one.scores, cards[0]?.clip.threshold ?? null);
+  const level = cards.length ? inPercent(cards[0].clip.threshold) : null;
+  addRow(seen, CONTACT, (one) => one.scores.map(inPercent), level, REACH[CONTACT]);
   for (const name of names) addRow(labels, name.replace("label.", ""), (one) => one.clip.curves[name] ?? [null], null);
   node.hidden = length < 2;
   const draw = (t) => {
@@ -298,9 +329,42 @@ function timeline(cards, length, seek) {
   return { node, playing, draw };
 }
 
-function showTable(source, about, start = 0) {
+const MANY = 12; // touches from which their thumbnails are shown first
+
+// Thumbnails of the touches that pass the filters. Pictures are read when they come into view.
+function touchGrid(source, filters, open) {
+  const pictures = framesOf(source, "frame"), tiles = el("div", { className: "thumbs" }), more = el("button", {}, "Show more");
+  const node = el("div", { className: "column" }, tiles, more);
+  let shown = 0, asked = 0;
+  const seen = new IntersectionObserver((entries) => entries.filter((entry) => entry.isIntersecting).forEach(({ target }) => {
+    seen.unobserve(target);
+    target.querySelector("figure").prepend(pictures.image(Number(target.dataset.row), target.dataset.name));
+    target.querySelector(".blank").remove();
+  }), { rootMargin: "200px" });
+  const load = guard(async (start) => {
+    const mine = ++asked;
+    const found = await json(`${source}/touches?start=${start}&filters=${encodeURIComponent(JSON.stringify(filters))}`);
+    if (mine !== asked) return;
+    if (!start) tiles.replaceChildren();
+    for (const one of found.touches) {
+      const caption = [one.name, ...one.sensors].join(", ");
+      const tile = el("button", { onclick: () => open(one.place) }, el("figure", {}, el("div", { className: "blank" }), el("figcaption", {}, caption)));
+      Object.assign(tile.dataset, { row: one.row, name: caption });
+      tiles.append(tile);
+      seen.observe(tile);
+    }
+    shown = start + found.touches.length;
+    more.hidden = shown >= found.count;
+    if (!found.count) tiles.append(el("p", {}, "No touch passes these filters."));
+  });
+  more.addEventListener("click", () => load(shown));
+  return { node, load: () => load(0), stop: () => seen.disconnect() };
+}
+
+function showTable(source, about, start = null) {
   const pictures = framesOf(source), filters = {}, clips = el("div", { className: "clips" }), below = el("div", { className: "column" });
-  let place = start, count = 0, cards = [], t = 0, length = 1, timer = null, asked = 0, busy = false, axis = timeline([], 1);
+  const look = el("div", { className: "look" }, clips, below);
+  let place = start ?? 0, count = 0, isGrid = start === null && about.touches > MANY, cards = [], t = 0, length = 1, timer = null, asked = 0, busy = false, axis = timeline([], 1);
   const title = el("h2"), subtitle = el("p", { className: "soft small" }), number = el("input", { type: "number", min: 1, value: 1, ariaLabel: "number of the touch", onchange: () => go(number.value - 1) });
   const total = el("span", { className: "soft" });
   const pause = () => { clearInterval(timer); timer = null; axis.playing.textContent = "Play"; };
@@ -347,7 +411,8 @@ function showTable(source, about, start = 0) {
     axis.playing.addEventListener("click", () => (timer ? pause() : play()));
     clips.replaceChildren(...cards.map((one) => one.node));
     const several = cards.length > 1 && length > 1;
-    below.replaceChildren(axis.node, ...(several ? [el("div", { className: "legend small" }, ...legend(cards.map((one) => one.clip.sensor ?? ""), true))] : []));
+    look.classList.toggle("single", cards.length === 1);
+    below.replaceChildren(...(cards.length === 1 ? [cards[0].words] : []), axis.node, ...(several ? [el("div", { className: "legend small" }, ...legend(cards.map((one) => one.clip.sensor ?? ""), true))] : []));
     if (found.more) below.append(el("p", {}, `${found.more} more recordings of this touch are not shown.`));
     say("");
     await move(0);
@@ -356,7 +421,7 @@ function showTable(source, about, start = 0) {
   const filterBar = el("div", { className: "bar" }), filterBox = el("details", { open: window.innerWidth > 800 && Object.keys(about.filters).length < 7 }, el("summary", {}, "Filters"), filterBar);
   const addFilter = (name, values) => {
     const short = name.replace("label.", "");
-    const change = (value) => { if (value) filters[name] = value; else delete filters[name]; go(0); };
+    const change = (value) => { if (value) filters[name] = value; else delete filters[name]; place = 0; refresh(); };
     if (values.length <= 60) {
       filterBar.append(option(short, [["", "all"], ...values.map((value) => [value, value])], "", change));
     } else {
@@ -367,7 +432,7 @@ function showTable(source, about, start = 0) {
   };
   const same = (name) => String(about.filters[name]) === String(about.filters[name.replace("label.", "")]);
   Object.keys(about.filters).filter((name) => !name.startsWith("label.") || !same(name)).forEach((name) => addFilter(name, about.filters[name]));
-  const step = (by) => () => { if (count) go((place + by + count) % count); };
+  const step = (by) => () => { if (count && !isGrid) go((place + by + count) % count); };
   const layers = layerBar(about.layers, guard(async () => {
     const slow = setTimeout(() => say("Opening the encoder. This takes some seconds."), 500);
     await move(t);
@@ -375,18 +440,34 @@ function showTable(source, about, start = 0) {
     say("");
     if (length > 1) await measure(asked);
   }));
-  const turning = el("div", { className: "bar push", hidden: true }, el("button", { onclick: step(-1), ariaLabel: "previous touch" }, "←"), number, total,
+  const turning = el("div", { className: "bar", hidden: true }, el("button", { onclick: step(-1), ariaLabel: "previous touch" }, "←"), number, total,
     el("button", { onclick: step(1), ariaLabel: "next touch" }, "→"));
   filterBox.hidden = !filterBar.children.length;
-  main.replaceChildren(el("div", { className: "bar" }, el("div", {}, title, subtitle), turning), filterBox, layers.node, clips, below);
+  const one = el("div", { className: "column" }, layers.node, look), all = el("button", { hidden: about.touches < 2, onclick: () => turn(!isGrid) });
+  const grid = touchGrid(source, filters, (to) => { place = to; turn(false); });
+  const refresh = () => {
+    one.hidden = isGrid;
+    grid.node.hidden = !isGrid;
+    turning.hidden = isGrid || about.touches < 2;
+    all.textContent = isGrid ? "One by one" : "All touches";
+    if (!isGrid) { go(place); return; }
+    pause();
+    asked++;
+    title.textContent = state.sources[source].name;
+    subtitle.textContent = `${about.touches.toLocaleString("en")} touches`;
+    grid.load();
+  };
+  const turn = (toGrid) => { isGrid = toGrid; refresh(); };
+  main.replaceChildren(el("div", { className: "bar" }, el("div", {}, title, subtitle), el("div", { className: "bar push" }, all, turning)), filterBox, grid.node, one);
   keys([...(about.touches > 1 ? [["ArrowLeft", "previous touch", step(-1)], ["ArrowRight", "next touch", step(1)]] : []),
     [" ", "play or pause", () => axis.playing.click()], [",", "frame back", () => { pause(); move(t - 1); }],
     [".", "frame on", () => { pause(); move(t + 1); }], ["l", "next layer", layers.next],
+    ...(about.touches > 1 ? [["a", "all touches", () => turn(!isGrid)]] : []),
     ...(filterBox.hidden ? [] : [["f", "filters", () => { filterBox.open = true; filterBar.querySelector("select, input")?.focus(); }]])]);
   const resized = () => axis.draw(t);
   window.addEventListener("resize", resized);
-  state.stop = () => { pause(); asked++; window.removeEventListener("resize", resized); };
-  go(place);
+  state.stop = () => { pause(); asked++; grid.stop(); window.removeEventListener("resize", resized); };
+  refresh();
 }
 
 // ---- start -------------------------------------------------------------------------------------------------------
@@ -405,8 +486,12 @@ function showStart(source, about) {
     el("span", {}, el("b", {}, `Camera ${number}`), ` ${name}`), el("button", { className: "main push", onclick: () => open(number) }, `Open camera ${number}`)));
   const found = cameras.length ? [el("ul", { className: "steps" }, ...cameras)] : [el("p", {}, "No camera was found. Plug in a sensor, then look again.")];
   const step = (text, command) => el("li", {}, el("p", {}, text), el("code", {}, command));
+  const example = el("button", { className: cameras.length ? "" : "main", onclick: () => open(about.example) }, "Play the built-in recording");
   main.replaceChildren(el("h2", {}, "What do you want to see?"), el("div", { className: "split" },
-    el("section", { className: "card" }, el("h3", {}, "A camera"), ...found, again),
+    el("div", { className: "column" },
+      el("section", { className: "card" }, el("h3", {}, "A camera"), ...found, again),
+      el("section", { className: "card" }, el("h3", {}, "No sensor at hand"),
+        el("p", {}, "Two things press a gel in turn. Watch depth and force, and teach their names as you would with a camera."), example)),
     el("section", { className: "card" }, el("h3", {}, "Something else"), el("ul", { className: "steps" },
       step("A film in the place of a camera", "anytouch view press.mp4 --live --sensor digit"),
       step("Recordings: a manifest, a folder or a film", "anytouch view recordings"),
@@ -422,7 +507,7 @@ function showStart(source, about) {
   keys([]);
 }
 
-function select(number, place = 0) {
+function select(number, place = null) {
   state.stop();
   state.stop = () => {};
   const { kind, about } = state.sources[number];

@@ -35,20 +35,14 @@ from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.schema import is_manifest
 from anytouch_jax.errors import UserError
 from anytouch_jax.live.cameras import list_cameras
-from anytouch_jax.live.page import tables
-from anytouch_jax.live.page.tables import (
-    LAYERS,
-    SIDE,
-    FeatureMap,
-    Run,
-    Table,
-    open_examples,
-    open_film,
-    scale_down,
-    title,
-)
+from anytouch_jax.live.examples import EXAMPLE
+from anytouch_jax.live.page.feature_map import FeatureMap
+from anytouch_jax.live.page.layers import LAYERS, SIDE, field_numbers, scale_down
+from anytouch_jax.live.page.runs import Run
+from anytouch_jax.live.page.tables import Table, open_examples, open_film, open_folder, title
 
-if TYPE_CHECKING:  # their libraries take seconds to import, and a manifest needs none of them
+# Its libraries take seconds to import, and a manifest needs none of them.
+if TYPE_CHECKING:
     from anytouch_jax.live.page.live import Live
 
 LOCAL = ("127.0.0.1", "localhost", "::1")
@@ -58,10 +52,10 @@ _SCRIPTS = ("page.js", "fields.js", "space.js", "live.js")
 _ASSETS = {"": "text/html", "page.css": "text/css"} | dict.fromkeys(_SCRIPTS, "text/javascript")
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' "
-    "blob: data:"
+    "blob: data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
 _SAFE = {
-    "Content-Security-Policy": f"{_POLICY}; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "Content-Security-Policy": _POLICY,
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
     "Cross-Origin-Resource-Policy": "same-origin",
@@ -73,8 +67,9 @@ Source: TypeAlias = "StartPage | Table | FeatureMap | Run | Live"
 
 
 class StartPage:
-    """The first page without anything to show: the cameras of this machine, which `open_camera`
-    opens.
+    """The first page without anything to show: the cameras of this machine.
+
+    `open_camera` opens one of them.
     """
 
     kind = "start"
@@ -84,21 +79,16 @@ class StartPage:
         self.open_camera = open_camera
 
     def about(self) -> dict[str, Any]:
-        """Return the cameras that are connected now."""
-        return {
-            "cameras": {
-                str(one.number): f"{one.name} {one.serial}".strip() for one in list_cameras()
-            }
-        }
+        """Return the cameras that are connected now, and the name of the built-in recording."""
+        cameras = {str(one.number): f"{one.name} {one.serial}".strip() for one in list_cameras()}
+        return {"cameras": cameras, "example": EXAMPLE}
 
 
 def open_sources(paths: Sequence[Path]) -> list[Source]:
     """Return what the page shows of each path: a manifest, a folder, a film, features or a run.
 
-    Raises UserError.
-
     Features show the pictures of a table among the paths, or of the manifest in their folder that
-    they were made from.
+    they were made from. Raises UserError for anything else.
     """
     tables = list[Table]()
     sources = list[Source]()
@@ -120,7 +110,10 @@ def open_sources(paths: Sequence[Path]) -> list[Source]:
     numbered = list(tables)
     for path in features:
         space = FeatureMap(path, numbered)
-        if space.table is None and (own := _own_manifest(path, space)) is not None:
+        own = None
+        if space.table is None:
+            own = _own_manifest(path, space)
+        if own is not None:
             numbered.append(own)
             space = FeatureMap(path, numbered)
         sources.append(space)
@@ -140,7 +133,7 @@ def _open_table(path: Path) -> Table:
     inside.sort(key=lambda file: file.stem != "manifest")
     if inside:
         return Table(manifests.read(inside[0]), title(inside[0]))
-    return tables.open_folder(path)
+    return open_folder(path)
 
 
 def _own_manifest(features: Path, space: FeatureMap) -> Table | None:
@@ -157,129 +150,20 @@ def _own_manifest(features: Path, space: FeatureMap) -> Table | None:
 def app(sources: list[Source], *, token: str = "", hosts: Sequence[str] = LOCAL) -> Starlette:
     """Return the ASGI application of the page.
 
-    With a `token`, requests for data need it. Other names than `hosts` are refused. Cameras are
-    added to `sources`.
+    Args:
+        sources: what it shows. Cameras that are opened by the page are added to it.
+        token: if not empty, requests for data need it.
+        hosts: names of the host. Others are refused.
     """
-
-    def source(request: Request, kind: str) -> Any:
-        number = request.path_params["source"]
-        if number >= len(sources) or sources[number].kind != kind:
-            raise UserError("There is no such source.")
-        return sources[number]
-
-    def listed(_: Request) -> Response:
-        about = [{"name": one.name, "kind": one.kind, "about": one.about()} for one in sources]
-        return _json(about)
-
-    def touch(request: Request, table: Table) -> Response:
-        filters = parse_json(request.query_params.get("filters", "{}"))
-        if not isinstance(filters, dict) or not all(
-            isinstance(value, str) for value in filters.values()
-        ):
-            raise UserError("Filters are texts by the name of their column.")
-        row = request.query_params.get("row")
-        place = (
-            _number(request, "place") if row is None else table.place_of(_number(request, "row"))
-        )
-        return _json(table.touch(place, filters))
-
-    def frame(request: Request, table: Table) -> Response:
-        view, score, fields = table.layer(request.path_params["row"], _layer(request))
-        headers = {"X-Score": "" if np.isnan(score) else f"{score:.2f}"}
-        if fields is not None:
-            headers["X-Fields"] = json.dumps(tables.field_numbers(fields))
-        return _picture(view, headers)
-
-    def recorded(request: Request, live: Live) -> Response:
-        if live.teacher.table is None:
-            raise UserError("Nothing is recorded yet.")
-        return frame(request, live.teacher.table)
-
-    def taught(request: Request, live: Live) -> Response:
-        file = live.teacher.head_file
-        if request.path_params["file"] == "head.npz" and file.is_file():
-            return Response(file.read_bytes(), media_type="application/octet-stream", headers=_SAFE)
-        if request.path_params["file"] != "recordings.zip":
-            raise UserError("There is no such file yet.")
-        packed = live.teacher.archive()
-        blocks = iter(partial(packed.read, 1 << 20), b"")
-        return StreamingResponse(blocks, headers=_SAFE, background=BackgroundTask(packed.close))
-
-    def of(kind: str, path: str, answer: Callable[[Request, Any], Response]) -> Route:
-        return Route(
-            f"/api/{{source:int}}/{path}", lambda request: answer(request, source(request, kind))
-        )
-
-    async def control(request: Request) -> Response:
-        if request.headers.get(HEADER) is None:
-            return _json({"error": "This request did not come from the page."}, 403)
-        body = b""
-        async for part in request.stream():
-            body += part
-            if len(body) > _LONGEST:
-                return _json({"error": "The request is too long."}, 413)
-        order = parse_json(body.decode())
-        number = request.path_params["source"]
-        if number < len(sources) and isinstance(start := sources[number], StartPage):
-            return _json({"source": await run_in_threadpool(_open, start, order, sources)})
-        await run_in_threadpool(_control, source(request, "live"), order)
-        return _json({"done": True})
-
-    def page(request: Request) -> Response:
-        name = request.path_params.get("name", "")
-        if name not in _ASSETS:
-            return Response("not found", 404, _SAFE)
-        data = (files("anytouch_jax.live.page") / (name or "page.html")).read_bytes()
-        return Response(
-            data, media_type=_ASSETS[name], headers=_SAFE | {"Cache-Control": "no-cache"}
-        )
-
     routes = [
-        Route("/", page),
-        Route("/{name:str}", page),
-        Route("/api/sources", listed),
-        of("table", "touch", touch),
-        of("table", "frame/{row:int}", frame),
-        of(
-            "table",
-            "photo/{row:int}",
-            lambda request, table: _picture(table.photo(request.path_params["row"])),
-        ),
-        of("space", "map", lambda request, space: _json(space.map(_method(request)))),
-        of(
-            "space",
-            "colours",
-            lambda request, space: _json(
-                space.colours(_method(request), request.query_params.get("column", ""))
-            ),
-        ),
-        of(
-            "space",
-            "neighbours",
-            lambda request, space: _json(
-                space.neighbours(
-                    _number(request, "row"), others=request.query_params.get("others") == "1"
-                )
-            ),
-        ),
-        of("run", "losses", lambda request, run: _json(run.losses(_number(request, "after")))),
-        of(
-            "run",
-            "figure/{name:str}",
-            lambda request, run: _picture(run.figure(request.path_params["name"]), side=4000),
-        ),
-        of(
-            "live",
-            "stream",
-            lambda request, live: StreamingResponse(
-                live.packets(_layer(request)), media_type="application/octet-stream", headers=_SAFE
-            ),
-        ),
-        of("live", "taught", lambda _, live: _json(live.teacher.about())),
-        of("live", "recorded/{row:int}", recorded),
-        of("live", "taught/{file:str}", taught),
-        Route("/api/{source:int}/control", control, methods=["POST"]),
+        Route("/", _asset),
+        Route("/{name:str}", _asset),
+        Route("/api/sources", _Sources(sources).listed),
+        Route("/api/{source:int}/control", _Sources(sources).control, methods=["POST"]),
     ]
+    for kind, answers in _ANSWERS.items():
+        for path, answer in answers.items():
+            routes.append(_Sources(sources).route(kind, path, answer))
     guards = [
         Middleware(TrustedHostMiddleware, allowed_hosts=list(hosts)),
         Middleware(_Token, token=token),
@@ -291,15 +175,179 @@ def app(sources: list[Source], *, token: str = "", hosts: Sequence[str] = LOCAL)
     )
 
 
+class _Sources:
+    """Finds the source that a request is for, by its number in the address."""
+
+    def __init__(self, sources: list[Source]) -> None:
+        self._sources = sources
+
+    def of(self, request: Request, kind: str) -> Any:
+        """Return the source of a request. Raises UserError for a number of another kind."""
+        number = request.path_params["source"]
+        if number >= len(self._sources) or self._sources[number].kind != kind:
+            raise UserError("There is no such source.")
+        return self._sources[number]
+
+    def route(self, kind: str, path: str, answer: Callable[[Request, Any], Response]) -> Route:
+        """Return the route of what a kind of source answers."""
+
+        def endpoint(request: Request) -> Response:
+            return answer(request, self.of(request, kind))
+
+        return Route(f"/api/{{source:int}}/{path}", endpoint)
+
+    def listed(self, _: Request) -> Response:
+        """Answer with all sources, and what the page can offer of them."""
+        return _json(
+            [{"name": one.name, "kind": one.kind, "about": one.about()} for one in self._sources]
+        )
+
+    async def control(self, request: Request) -> Response:
+        """Do what the page asks of a camera, or open one."""
+        if request.headers.get(HEADER) is None:
+            return _json({"error": "This request did not come from the page."}, 403)
+        body = b""
+        async for part in request.stream():
+            body += part
+            if len(body) > _LONGEST:
+                return _json({"error": "The request is too long."}, 413)
+        order = parse_json(body.decode())
+        number = request.path_params["source"]
+        start = self._sources[number] if number < len(self._sources) else None
+        if isinstance(start, StartPage):
+            return _json({"source": await run_in_threadpool(_open, start, order, self._sources)})
+        await run_in_threadpool(_control, self.of(request, "live"), order)
+        return _json({"done": True})
+
+
+def _asset(request: Request) -> Response:
+    """Answer with a file of the page, one of a table: no address names a file."""
+    name = request.path_params.get("name", "")
+    if name not in _ASSETS:
+        return Response("not found", 404, _SAFE)
+    data = (files("anytouch_jax.live.page") / (name or "page.html")).read_bytes()
+    headers = _SAFE | {"Cache-Control": "no-cache"}
+    return Response(data, media_type=_ASSETS[name], headers=headers)
+
+
+def _touch(request: Request, table: Table) -> Response:
+    """Answer with a touch by its place, or by one of its rows."""
+    filters = _filters(request)
+    if request.query_params.get("row") is None:
+        place = _number(request, "place")
+    else:
+        place = table.place_of(_number(request, "row"))
+    return _json(table.touch(place, filters))
+
+
+def _touches(request: Request, table: Table) -> Response:
+    """Answer with a page of touches."""
+    return _json(table.touches(_number(request, "start"), _filters(request)))
+
+
+def _filters(request: Request) -> dict[str, str]:
+    filters = parse_json(request.query_params.get("filters", "{}"))
+    if not isinstance(filters, dict) or not all(isinstance(one, str) for one in filters.values()):
+        raise UserError("Filters are texts by the name of their column.")
+    return filters
+
+
+def _frame(request: Request, table: Table) -> Response:
+    """Answer with a layer of a row, and its numbers in the headers."""
+    view, score, fields = table.layer(request.path_params["row"], _layer(request))
+    headers = {"X-Score": "" if np.isnan(score) else f"{score:.2f}"}
+    if fields is not None:
+        headers["X-Fields"] = json.dumps(field_numbers(fields))
+    return _picture(view, headers)
+
+
+def _photo(request: Request, table: Table) -> Response:
+    return _picture(table.photo(request.path_params["row"]))
+
+
+def _map(request: Request, space: FeatureMap) -> Response:
+    return _json(space.map(_method(request)))
+
+
+def _colours(request: Request, space: FeatureMap) -> Response:
+    return _json(space.colours(_method(request), request.query_params.get("column", "")))
+
+
+def _neighbours(request: Request, space: FeatureMap) -> Response:
+    others = request.query_params.get("others") == "1"
+    return _json(space.neighbours(_number(request, "row"), others=others))
+
+
+def _losses(request: Request, run: Run) -> Response:
+    return _json(run.losses(_number(request, "after")))
+
+
+def _figure(request: Request, run: Run) -> Response:
+    return _picture(run.figure(request.path_params["name"]), side=4000)
+
+
+def _stream(request: Request, live: Live) -> Response:
+    packets = live.packets(_layer(request))
+    return StreamingResponse(packets, media_type="application/octet-stream", headers=_SAFE)
+
+
+def _taught(_: Request, live: Live) -> Response:
+    return _json(live.teacher.about())
+
+
+def _recorded(request: Request, live: Live) -> Response:
+    """Answer with a layer of a recorded frame."""
+    if live.teacher.table is None:
+        raise UserError("Nothing is recorded yet.")
+    return _frame(request, live.teacher.table)
+
+
+def _download(request: Request, live: Live) -> Response:
+    """Answer with the head, or with a ZIP of the recordings."""
+    file = live.teacher.head_file
+    if request.path_params["file"] == "head.npz" and file.is_file():
+        return Response(file.read_bytes(), media_type="application/octet-stream", headers=_SAFE)
+    if request.path_params["file"] != "recordings.zip":
+        raise UserError("There is no such file yet.")
+    packed = live.teacher.archive()
+    blocks = iter(partial(packed.read, 1 << 20), b"")
+    return StreamingResponse(blocks, headers=_SAFE, background=BackgroundTask(packed.close))
+
+
+# What the kinds of sources answer, by the end of the address.
+_ANSWERS: dict[str, dict[str, Callable[[Request, Any], Response]]] = {
+    "table": {
+        "touch": _touch,
+        "touches": _touches,
+        "frame/{row:int}": _frame,
+        "photo/{row:int}": _photo,
+    },
+    "space": {"map": _map, "colours": _colours, "neighbours": _neighbours},
+    "run": {"losses": _losses, "figure/{name:str}": _figure},
+    "live": {
+        "stream": _stream,
+        "taught": _taught,
+        "recorded/{row:int}": _recorded,
+        "taught/{file:str}": _download,
+    },
+}
+
+
 def serve(sources: list[Source], host: str, port: int, show: Callable[[str], None]) -> None:
     """Serve the page until Ctrl-C. `show` gets its address.
 
     Raises UserError if the port is taken.
     """
-    is_local = host in LOCAL
-    token = "" if is_local else secrets.token_urlsafe(18)
+    if host in LOCAL:
+        # Another site could send a browser here under its own name, so names are checked.
+        application = app(sources, hosts=[*LOCAL, "[::1]"])
+        token = ""
+    else:
+        # Nobody knows by which name others reach this machine. The token keeps them out.
+        token = secrets.token_urlsafe(18)
+        application = app(sources, token=token, hosts=["*"])
     config = uvicorn.Config(
-        app(sources, token=token, hosts=[*LOCAL, "[::1]"] if is_local else ["*"]),
+        application,
         host=host,
         port=port,
         log_level="error",
@@ -308,15 +356,16 @@ def serve(sources: list[Source], host: str, port: int, show: Callable[[str], Non
         lifespan="off",
     )
     try:
-        listener = socket.create_server(
-            (host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET
-        )
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        listener = socket.create_server((host, port), family=family)
     except OSError as error:
         raise UserError(
             f"Port {port} of {host} cannot be used: {error.strerror}. Choose another --port."
         ) from None
     shown = f"[{host}]" if ":" in host else host
-    show(f"http://{shown}:{listener.getsockname()[1]}/{f'#token={token}' if token else ''}")
+    # What follows # never leaves the browser, so no log has the token.
+    secret = f"#token={token}" if token else ""
+    show(f"http://{shown}:{listener.getsockname()[1]}/{secret}")
     try:
         for one in _live(sources):
             one.start()
@@ -341,6 +390,7 @@ class _Token:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if self._token and scope["type"] == "http" and scope["path"].startswith("/api"):
             given = dict(scope["headers"]).get(b"authorization", b"")
+            # The time of this comparison says nothing about the token.
             if not hmac.compare_digest(given, f"Bearer {self._token}".encode()):
                 await _json({"error": "The token is missing or wrong."}, 401)(scope, receive, send)
                 return
@@ -353,7 +403,8 @@ def _open(start: StartPage, order: Any, sources: list[Source]) -> int:
     Raises UserError.
     """
     camera = order.get("camera") if isinstance(order, dict) else None
-    if not isinstance(camera, str) or camera not in start.about()["cameras"]:
+    about = start.about()
+    if not isinstance(camera, str) or camera not in (*about["cameras"], about["example"]):
         raise UserError("There is no such camera. Plug it in, and look again.")
     for one in _live(sources):
         if one.source == camera:
@@ -367,20 +418,23 @@ def _open(start: StartPage, order: Any, sources: list[Source]) -> int:
 
 def _control(live: Live, order: Any) -> None:
     """Do what the page asks of a live source. Raises UserError for anything else."""
-    order = order if isinstance(order, dict) else {}
-    action, name, sequence = (order.get(key) for key in ("do", "object", "sequence"))
+    if not isinstance(order, dict):
+        order = {}
+    action = order.get("do")
+    name = order.get("object")
+    sequence = order.get("sequence")
     rotate = order.get("rotate")
     flip = order.get("flip")
     if action == "orient" and rotate in (0, 90, 180, 270) and flip in ("none", "across", "down"):
         if live.recorder.state()["on"]:
             raise UserError("A recording is on. Stop it before you turn the picture.")
-        live.orient(rotate, flip)
+        live.frames.orient(rotate, flip)
     elif action == "background":
-        live.capture_background()
+        live.frames.capture_background()
     elif action == "no background":
-        live.set_background(None)
+        live.frames.set_background(None)
     elif action == "record" and isinstance(name, str):
-        live.recorder.start(name, live.gel)
+        live.recorder.start(name, live.frames.setup.gel)
     elif action == "stop":
         live.recorder.stop()
         live.teacher.reload()

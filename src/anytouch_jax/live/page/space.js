@@ -11,7 +11,7 @@ function hitCard(hit, pictures, open) {
 
 function showSpace(source, about) {
   let points = null, colours = null, chosen = -1, method = "pca", timer = null, marked = [];
-  let column = ["sensor", "object"].find((name) => about.columns.includes(name)) ?? about.columns[0] ?? "";
+  let column = ["object", "sensor"].find((name) => about.columns.includes(name)) ?? about.columns[0] ?? "";
   const pictures = about.table === null ? null : framesOf(about.table, "frame");
   const names = el("div", { className: "legend small" }), side = el("div", { className: "column" });
   const others = el("input", { type: "checkbox", checked: about.sensors > 1 });
@@ -112,14 +112,15 @@ function showSpace(source, about) {
     const shown = points.rows.length < about.count ? `, ${points.rows.length.toLocaleString("en")} of them drawn` : "";
     say(`${about.count.toLocaleString("en")} features by ${about.from.encoder ?? "an unknown encoder"}${shown}`);
     await recolour();
+    choose(nearest(map.clientWidth / 2, map.clientWidth / 2, map.clientWidth));
   });
   others.addEventListener("change", () => choose(chosen));
   const bar = el("div", { className: "bar" },
     option("map", [["pca", "PCA"], ["tsne", "t-SNE"]], method, (value) => { method = value; load(); }),
     option("colour", about.columns.map((name) => [name, name.replace("label.", "")]), column, (value) => { column = value; recolour(); }),
     el("label", { hidden: about.sensors < 2 }, others, "neighbours of other sensors only"));
-  side.append(el("p", { className: "soft" }, "Click a point, or move with the arrow keys on the map."));
-  main.replaceChildren(el("h2", {}, state.sources[source].name), bar, el("div", { className: "split" }, el("div", { className: "column" }, map, names), side));
+  const hint = el("p", { className: "soft small" }, "Click a point, or move with the arrow keys on the map.");
+  main.replaceChildren(el("h2", {}, state.sources[source].name), bar, el("div", { className: "split" }, el("div", { className: "column" }, map, hint, names), side));
   keys([["m", "to the map", () => map.focus()], ["c", "colour", () => bar.querySelectorAll("select")[1].focus()]]);
   window.addEventListener("resize", draw);
   state.stop = () => { clearInterval(timer); window.removeEventListener("resize", draw); };
@@ -135,14 +136,24 @@ function showRun(source) {
   const names = el("div", { className: "legend small" }), facts = el("div", { className: "facts" }), wide = el("div", { className: "wide" });
   const pick = el("select", { onchange: () => figure(pick.value) });
   const figureLabel = el("label", { hidden: true }, "figure: reconstructions, masks and predicted frames", pick);
+  // Of stills the loss is the reconstruction, and one line is enough.
+  const isAgain = (term) => term === "reconstruction" && lines.every((line) => !(term in line) || Math.abs(line[term] - line.loss) < 1e-9 * Math.abs(line.loss));
+  // A mean that forgets: over a fiftieth of the steps, so that what moves can be seen through the noise.
+  const smooth = (values) => {
+    const keep = Math.exp(-50 / Math.max(values.length, 50));
+    let mean = values[0];
+    return values.map((value) => (mean = keep * mean + (1 - keep) * value));
+  };
   const draw = () => {
-    const terms = TERMS.filter((term) => lines.some((line) => term in line));
-    const curves = terms.map((name, i) => {
-      const some = lines.filter((line) => name in line);
-      return { name, x: some.map((line) => line.step), values: some.map((line) => line[name]), ...looks(i) };
+    const terms = TERMS.filter((term) => lines.some((line) => term in line) && !isAgain(term));
+    const curves = terms.flatMap((name, i) => {
+      const some = lines.filter((line) => name in line), x = some.map((line) => line.step), values = some.map((line) => line[name]);
+      return [{ x, values, ...looks(i), faint: true, dash: [] }, { x, values: smooth(values), ...looks(i) }];
     });
-    chart(canvas, curves, { log });
-    names.replaceChildren(...legend(terms, true));
+    const untrained = lines[0]?.[terms[0]] ?? null;
+    chart(canvas, curves, { log, level: untrained });
+    names.replaceChildren(...legend(terms, true), ...(untrained === null ? [] : [el("span", {}, swatch(getComputedStyle(document.body).getPropertyValue("--soft"), [4, 4]),
+      `baseline: ${terms[0]} at the first step, ${Number(untrained.toPrecision(3))}`)]), el("span", {}, "faint: every step, firm: smoothed"));
     const last = lines[lines.length - 1] ?? {};
     facts.replaceChildren(...["step", ...TERMS, "seconds", "learning_rate"].filter((name) => name in last).map((name) =>
       el("div", { className: "fact" }, name.replace("_", " "), el("b", {}, Number(last[name].toPrecision(5)).toString()))));

@@ -3,11 +3,12 @@
 Sizes, gels and dots are those of `anytouch_jax.sensors`. This module adds how a sensor looks. A new
 sensor is a new record there and a new entry of `SENSORS` here; for your own see `own`.
 
-`photometry.npz` has the untouched gels of camera sensors and the colours of their dents
-(`experiments/results/tried.md`). GelSight, GelSight Mini, DIGIT and 9DTact look like real units.
-The colours of the Mini are fitted to 17 presses of a ball of 6.31 mm (GelSLAM) by `fitting.fit`.
-Its `contrast` makes simulated balls as strong as real ones. GelSlim and DuraGel are a few lights
-each, set by eye. Tac3D measures a field and has no image.
+`photometry.npz` has the colours of the dents of camera sensors (`experiments/results/tried.md`),
+and the untouched gels of the two whose appearance is set by eye. Those of real instances are in
+`data.background.layout`. GelSight, GelSight Mini, DIGIT and 9DTact look like real instances. The
+colours of the Mini are fitted to 17 presses of a ball of 6.31 mm (GelSLAM) by `fitting.fit`. Its
+`contrast` makes simulated balls as strong as real ones. GelSlim and DuraGel are a few lights each,
+set by eye. Tac3D measures a field and has no image.
 """
 
 import math
@@ -21,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
+from anytouch_jax.data.background.layout import known_gels
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import read_arrays
 from anytouch_jax.sensors import RECORDS, Markers
@@ -127,10 +129,15 @@ def bases(sensor: Sensor) -> Array:
     """
     if sensor.kind == "field":
         return np.zeros((1, 30, 30, 3), np.float32)
-    stored = _stored(sensor)["bases"]
-    if stored.dtype == np.uint8:
-        return stored.astype(np.float32) / 255
-    return stored
+    stored = _stored(sensor)
+    if "bases" in stored:
+        bases_of = stored["bases"]
+    else:
+        # of real units; the core knows these, because it checks cameras by them
+        bases_of = np.stack(known_gels(sensor.name))
+    if bases_of.dtype == np.uint8:
+        return bases_of.astype(np.float32) / 255
+    return bases_of
 
 
 def look(sensor: Sensor) -> Photometry:

@@ -1,0 +1,51 @@
+"""Words for a sensor: a name, or a folder NAME.sensor of `anytouch sensor fit`.
+
+Every command and function that takes a sensor resolves its word here, so that a fitted sensor is
+taken wherever a name is.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+from anytouch_jax.config import OWN_SENSOR
+from anytouch_jax.doors import SENSORS, enter
+
+
+class SensorWord(NamedTuple):
+    """The name that a word stands for, and what a fitted sensor knows of itself.
+
+    Attributes:
+        name: that of the table of tokens.
+        width_mm: what the width of a picture shows.
+        shape: height of a picture over its width.
+        modulus_kpa: of the gel.
+    """
+
+    name: str
+    width_mm: float | None = None
+    shape: float | None = None
+    modulus_kpa: float | None = None
+
+    @property
+    def is_fitted(self) -> bool:
+        """Whether the word is a folder of `anytouch sensor fit`."""
+        return self.width_mm is not None
+
+
+def resolve_sensor(word: str | Path) -> SensorWord:
+    """Return what a word stands for.
+
+    Raises UserError for a folder NAME.sensor that is missing or damaged.
+    """
+    path = Path(word)
+    if path.suffix != OWN_SENSOR:
+        return SensorWord(str(word))
+    numbers = enter(SENSORS["fitted"])(path.expanduser())
+    return SensorWord(
+        numbers.name,
+        width_mm=numbers.width_mm,
+        shape=numbers.height_mm / numbers.width_mm,
+        modulus_kpa=numbers.modulus_kpa,
+    )

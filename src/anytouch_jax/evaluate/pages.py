@@ -1,0 +1,108 @@
+"""Report pages: sections of text, figures and tables in one Markdown file, and one HTML page."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from anytouch_jax.errors import UserError
+from anytouch_jax.evaluate.tables import plain
+from anytouch_jax.files import atomic_write
+
+_STYLE = (
+    "body{font:16px/1.5 sans-serif;max-width:60rem;margin:2rem auto;padding:0 "
+    "1rem}img{max-width:100%}"
+    "table{border-collapse:collapse;display:block;overflow-x:auto}td,th{border:1px solid "
+    "#ccc;padding:.2em .6em}"
+)
+# No script, no form and no address: captions of strangers stand on the page.
+_POLICY = (
+    "default-src 'none'; img-src data:; style-src 'unsafe-inline'; base-uri 'none'; "
+    "form-action 'none'"
+)
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of a report, in this order: text, figure, table (Markdown), notes."""
+
+    title: str
+    text: str = ""
+    table: str = ""
+    figure: Path | None = None
+    notes: str = ""
+
+
+def write_report(
+    folder: Path,
+    sections: Sequence[Section],
+    *,
+    title: str = "Report",
+    numbers: Mapping[str, Any] | None = None,
+) -> Path:
+    """Write report.html, report.md, report.json and the figures, and return the path of report.md.
+
+    Each file is written atomically, report.md last, so a report that is there is whole.
+
+    Args:
+        folder: of the files; figures go into its folder figures/.
+        sections: in their order.
+        title: of the page.
+        numbers: of report.json.
+
+    Raises:
+        UserError: for a missing figure.
+        OSError: for a full disk.
+    """
+    parts = [f"# {title}"]
+    for section in sections:
+        parts += [f"## {section.title}", section.text]
+        if section.figure is not None:
+            if not section.figure.is_file():
+                raise UserError(
+                    f"There is no figure {section.figure} for the report. Draw it first, or leave "
+                    "it out."
+                )
+            atomic_write(folder / "figures" / section.figure.name, section.figure.read_bytes())
+            parts.append(f"![{section.title}](figures/{section.figure.name})")
+        parts += [section.table, section.notes]
+    if numbers is not None:
+        text = json.dumps(plain(numbers), indent=2, allow_nan=False) + "\n"
+        atomic_write(folder / "report.json", text)
+    text = "\n\n".join(part.strip() for part in parts if part) + "\n"
+    atomic_write(folder / "report.html", html_page(text, folder, title))
+    atomic_write(folder / "report.md", text)
+    return folder / "report.md"
+
+
+def html_page(text: str, folder: Path, title: str) -> str:
+    """Return Markdown as one HTML page with the pictures of `folder`/figures inside.
+
+    HTML in the Markdown is shown as text, and no script runs.
+    """
+    from markdown_it import MarkdownIt
+
+    def inside(match: re.Match[str]) -> str:
+        path = folder / "figures" / match[1]
+        data = b""
+        if path.suffix == ".png" and path.is_file():
+            data = path.read_bytes()
+        return f'src="data:image/png;base64,{base64.b64encode(data).decode()}"'
+
+    body = MarkdownIt("commonmark", {"html": False}).enable("table").render(text)
+    # A name without slashes: a caption cannot make the page read a file of another folder.
+    body = re.sub(r'src="figures/([^"/\\]+)"', inside, body)
+    head = (
+        f'<meta charset="utf-8"><meta http-equiv="Content-Security-Policy" content="{_POLICY}">'
+        f'<meta name="viewport" content="width=device-width"><title>{html.escape(title)}</title>'
+    )
+    return (
+        f'<!doctype html>\n<html lang="en"><head>{head}<style>{_STYLE}</style></head>\n'
+        f"<body>{body}</body></html>\n"
+    )

@@ -1,0 +1,97 @@
+"""How live frames are read: their orientation, their background, and what measures them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from anytouch_jax.data.background.estimate import UntouchedGel
+from anytouch_jax.data.background.rule import RunningGel
+from anytouch_jax.data.transforms import Flip, orient_frame
+from anytouch_jax.encoder.arrays import Array
+from anytouch_jax.encoder.base import Preprocess
+from anytouch_jax.live.page.layers import last_clip, scale_down
+
+if TYPE_CHECKING:
+    from anytouch_jax.encoder.encoder import Encoder
+    from anytouch_jax.encoder.measured import Fields, Measure
+
+
+class Setup(NamedTuple):
+    """How frames are read. A frame is read by one setup, whatever the page asks for meanwhile.
+
+    Attributes:
+        rotate: degrees clockwise.
+        flip: after the rotation.
+        running: the estimate of the background, None if a picture of it was given.
+        gel: the background RGB u8 (h, w, 3), turned as frames are.
+        small: the background, scaled down, and ready to be compared.
+        preprocess: makes the encoder's input of a turned frame.
+        measure: measures depth and force, None if the encoder does not.
+    """
+
+    rotate: int
+    flip: Flip
+    running: RunningGel | None
+    gel: Array | None
+    small: tuple[Array, UntouchedGel] | None
+    preprocess: Preprocess
+    measure: Measure | None
+
+    def turned(self, picture: Array) -> Array:
+        """Return a picture as read, turned."""
+        return np.ascontiguousarray(orient_frame(picture, self.rotate, self.flip))
+
+    def is_turned_as(self, other: Setup) -> bool:
+        """Return whether pictures of both are turned in one way."""
+        return (self.rotate, self.flip) == (other.rotate, other.flip)
+
+
+def make_setup(
+    encoder: Encoder,
+    sensor: str,
+    rotate: int,
+    flip: Flip,
+    gel: Array | None,
+    running: RunningGel | None = None,
+) -> Setup:
+    """Return a setup with a background.
+
+    Args:
+        encoder: what frames are prepared for.
+        sensor: its name, or that of the universal tokens.
+        rotate: degrees clockwise.
+        flip: after the rotation.
+        gel: the background RGB u8 (h, w, 3), turned as frames are, None to estimate it.
+        running: the estimate that `gel` comes from, if it was not given by hand.
+    """
+    if gel is None and running is None:
+        running = RunningGel()
+    small = None
+    if gel is not None:
+        small = scale_down(gel), UntouchedGel(gel)
+    measure = None
+    if encoder.measures:
+        measure = encoder.measure_of(sensor, gel, log=lambda _: None)
+    # Frames are turned before, so the encoder's preprocessing does not.
+    return Setup(rotate, flip, running, gel, small, Preprocess(encoder, gel), measure)
+
+
+def measure_last(
+    encoder: Encoder, measure: Measure, row: int, picture: Array, prepared: list[Array]
+) -> Fields:
+    """Return the fields of a picture.
+
+    Args:
+        encoder: the one that `measure` is of.
+        measure: turns its raw fields into mm and N.
+        row: of its table of sensors.
+        picture: RGB u8 (h, w, 3), turned.
+        prepared: the encoder's input of some frames u8 (H, W, 3), of which it is the last.
+    """
+    clip = last_clip(prepared, encoder.config.model.frames)
+    rows = np.array([row], np.int32)
+    aspect = np.log([picture.shape[0] / picture.shape[1]]).astype(np.float32)
+    raw = encoder.encode_and_measure(clip[None], rows, aspect)[1]
+    return measure(raw, [picture])

@@ -1,0 +1,1 @@
+"""The former place of `anytouch_jax.live.page`, see `anytouch_jax.renamed`."""

@@ -101,6 +101,14 @@ def takes_manifest(options: SensorOptions, data: Sequence[Path], of_rows: Sequen
         raise UserError(
             f"there is no manifest, folder or video at {data[0]}. Give another path with --data."
         )
+    from anytouch_jax.data.containers import kind_of
+
+    kind = kind_of(data[0])
+    if kind in ("hdf5", "zarr"):
+        raise UserError(
+            f"{data[0]} is {kind}, which can hold several cameras and recordings. Make a manifest "
+            f"of it: anytouch data index {kind} {data[0]} --sensor NAME"
+        )
     refuse_unused(options, of_rows, "with a folder or a video, which has no splits and no columns")
     return False
 
@@ -447,7 +455,7 @@ def _frames_of_folder(data: Path, on_bad_sample: str) -> Iterator[NumberedFrame]
     # The first frame number of a finger. Numbers of two fingers have a gap between them, because no
     # clip spans both.
     start = 0
-    for names in split_series([file.name for file in files]).values():
+    for names in split_series([file.relative_to(data).as_posix() for file in files]).values():
         numbers = [start + number for number in frame_numbers(names)]
         start = numbers[-1] + 2
         for number, name in zip(numbers, names, strict=True):

@@ -177,9 +177,7 @@ class DatasetOptions:
     # Let the reader write pictures into ROOT, for a dataset of arrays or videos.
     export: bool = False
     sensor: str | None = None
-    """recordings, webdataset, lerobot, bags, hdf5, zarr: the sensor, by its name in the configuration or a new
-    name.
-    """
+    """recordings, webdataset, lerobot, bags, hdf5, zarr: the sensor, by its name or a new name."""
     split_by: str | None = None
     """recordings: what is held out: object, recording (a single picture is one), a column of the
     labels, or the part of the path in the parentheses of a pattern, as '(p[0-9]+)_'. Default:
@@ -201,8 +199,8 @@ class DatasetOptions:
     left.jpg. hdf5, zarr: arrays of tactile images, as obs/tactile.
     """
     values: tuple[str, ...] = ()
-    """lerobot, hdf5, zarr: features or arrays that become labels. bags: labels from other topics, as
-    force_z=/ft:wrench.force.z.
+    """lerobot, hdf5, zarr: features or arrays that become labels. bags: labels from other topics,
+    as force_z=/ft:wrench.force.z.
     """
 
 

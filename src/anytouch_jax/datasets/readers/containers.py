@@ -674,7 +674,7 @@ _USES = ("val", "test", "sensor", "keys", "values")
 READERS = {
     "hdf5": DatasetReader(
         _read,
-        "<recording>.h5 or <recording>.hdf5 with arrays of images",
+        "<recording>.h5",
         "nothing, unless their owner asks for it",
         "as their owner says",
         uses=_USES,
@@ -682,7 +682,7 @@ READERS = {
     ),
     "zarr": DatasetReader(
         _read,
-        "<recording>.zarr or <recording>.zarr.zip with arrays of images",
+        "<recording>.zarr",
         "nothing, unless their owner asks for it",
         "as their owner says",
         uses=_USES,

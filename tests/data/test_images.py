@@ -326,9 +326,9 @@ def test_a_film_that_opencv_cannot_decode_is_read_or_its_codec_is_named(
     )
     if codec is None:
         pytest.skip("this build of PyAV writes no AV1")
-    film = tmp_path / f"film.{ending}"
+    path = tmp_path / f"film.{ending}"
     greys = [60 + 20 * i for i in range(6)]
-    with av.open(str(film), "w") as out:
+    with av.open(str(path), "w") as out:
         stream = out.add_stream(codec, rate=10)
         stream.width = 64
         stream.height = 64
@@ -339,15 +339,15 @@ def test_a_film_that_opencv_cannot_decode_is_read_or_its_codec_is_named(
             )
             out.mux(stream.encode(picture))
         out.mux(stream.encode())
-    frames = list(images.timed_frames(film))
+    frames = list(images.timed_frames(path))
     assert [round(time, 2) for time, _ in frames] == pytest.approx(
         [i / 10 for i in range(6)], abs=0.01
     )
     np.testing.assert_allclose([frame.mean() for _, frame in frames], greys, atol=3)
-    video = images.open_video(film)
+    video = images.open_video(path)
     for frame, grey in ((4, 140), (1, 80)):
         assert video.set(cv2.CAP_PROP_POS_FRAMES, frame) and video.read()[
             1
         ].mean() == pytest.approx(grey, abs=3)
     monkeypatch.setitem(sys.modules, "av", None)
-    refused(r"of the codec AV01: pip install 'anytouch_jax\[lerobot\]'", images.open_video, film)
+    refused(r"of the codec AV01: pip install 'anytouch_jax\[lerobot\]'", images.open_video, path)

@@ -395,7 +395,7 @@ def contact_of_rows(
     known = contact.known_contact(manifest)[rows]
     limits = contact.threshold_of_rows(manifest, None, 0.0)[rows]
     unknown = rows[np.isnan(known)]
-    score = contact.contact_scores(manifest, unknown, gels=gels or UnitGels(manifest)).score[rows]
+    score = contact.contact_scores(manifest, unknown, served=gels or UnitGels(manifest)).score[rows]
     by_score = np.where(np.isnan(score), np.nan, score > limits)
     return np.where(np.isnan(known), by_score, known)
 

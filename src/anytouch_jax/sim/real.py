@@ -129,11 +129,11 @@ def _real_gels(
             # Some 300 frames are enough for a median.
             some = frame[same[:: max(1, len(same) // 300)]]
             medians[own] = np.median(some, axis=0).astype(np.uint8)
-        picture = medians[own]
+        shown = medians[own]
         if stored[place] >= 0:
             image = read_image(manifest, int(rows[place]), "background_path")
-            picture = touch_evaluation([image], size)[0]
-        gels.append(np.stack([picture, medians[own]]))
+            shown = touch_evaluation([image], size)[0]
+        gels.append(np.stack([shown, medians[own]]))
     return np.stack(gels), group.ravel().astype(np.int32)
 
 

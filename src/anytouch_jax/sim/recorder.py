@@ -165,7 +165,7 @@ class View(NamedTuple):
     pitch: float | Array  # mm of the solve grid
     image: tuple[int, int]  # (height, width) in pixels
     photometry: optics.Photometry | None = None  # instead of that of the sensor
-    stretched: bool = False  # as in `optics.picture_view`
+    stretched: bool = False  # as in `optics.pixel_positions`
     # (height, width) of the fields of the last frame. If it is None, all frames have fields, in the
     # size of the image.
     fields: tuple[int, int] | None = None
@@ -213,17 +213,17 @@ def simulate_clip(
         measured = _measured(contact, sensor, clip.unit.noise, view.pitch, keys[1:])
         return ClipOutput(None, None, measured, labels)
     behind = optics.backdrop(sensor, clip.unit, view.image, stretched=view.stretched)
-    picture = optics.Picture(sensor, clip.unit, view.image, view.photometry, view.stretched)
+    camera = optics.Camera(sensor, clip.unit, view.image, view.photometry, view.stretched)
 
     def shown(dent: Array, moved: Array, key: Array, drift: Leaf) -> Array:
         skin = optics.Skin(dent, moved, view.pitch)
-        return optics.show(skin, picture, key, behind=behind, drift=drift)
+        return optics.show(skin, camera, key, behind=behind, drift=drift)
 
     image = jax.vmap(shown)(
         contact.press.displacement, contact.shear.displacement, keys[1:], clip.drift
     )
-    background = optics.show(None, picture, keys[0], behind=behind)
-    mapped = _fields(fields, contact, picture, view)
+    background = optics.show(None, camera, keys[0], behind=behind)
+    mapped = _fields(fields, contact, camera, view)
     return ClipOutput(image, background, mapped, labels)
 
 
@@ -341,7 +341,7 @@ def _depth(clip: ClipInput, relief: Array) -> Array:
 
 
 def _fields(
-    names: tuple[str, ...], contact: _Contact, picture: optics.Picture, view: View
+    names: tuple[str, ...], contact: _Contact, camera: optics.Camera, view: View
 ) -> Array | None:
     """Return the fields `names` at the image's pixels as channels.
 
@@ -356,8 +356,8 @@ def _fields(
     onto_picture = partial(
         optics.onto_picture,
         pitch=view.pitch,
-        sensor=picture.sensor,
-        unit=picture.unit,
+        sensor=camera.sensor,
+        unit=camera.unit,
         resolution=view.fields or view.image,
         stretched=view.stretched,
     )

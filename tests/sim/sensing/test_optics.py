@@ -193,7 +193,7 @@ def test_a_gel_pressed_deeply_all_over_is_no_darker_than_the_deepest_dent_of_the
 
 def test_the_vignette_darkens_a_dent_as_it_darkens_the_untouched_gel():
     dark = replace(SLIM, vignette=0.8)
-    place = optics.picture_view(dark, PLAIN, SIZE)
+    place = optics.pixel_positions(dark, PLAIN, SIZE)
 
     def change(sensor):
         draw = partial(optics.render, pitch=PITCH, sensor=sensor, unit=PLAIN, resolution=SIZE)

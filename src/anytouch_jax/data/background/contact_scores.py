@@ -86,7 +86,7 @@ def contact_scores(
     rows: np.ndarray | None = None,
     *,
     backgrounds: Mapping[str, UntouchedGel] | None = None,
-    gels: UnitGels | None = None,
+    served: UnitGels | None = None,
     workers: int = 2,
 ) -> ContactScores:
     """Return the score of every row, or of some.
@@ -98,7 +98,7 @@ def contact_scores(
         manifest: The frames.
         rows: Row ids, by default all.
         backgrounds: Pictures from `read_backgrounds` for rows without one.
-        gels: Serve all rows by the rule of `rule.py`, instead of estimates by recording.
+        served: Serve all rows by the rule of `rule.py`, instead of estimates by recording.
         workers: Threads that read pictures.
     """
     if workers < 1:
@@ -106,10 +106,10 @@ def contact_scores(
     rows = np.arange(len(manifest)) if rows is None else np.asarray(rows)
     with ThreadPoolExecutor(workers) as pool:
         scorer = _Scorer(manifest, pool)
-        if gels is not None:
-            has_background = gels.has(rows)
+        if served is not None:
+            has_background = served.has(rows)
             scorer.refuse(rows[~has_background], "none: no picture of the untouched gel")
-            scorer.score_given(gels, rows[has_background])
+            scorer.score_given(served, rows[has_background])
         else:
             has_background = manifest.present("background_path")[rows]
             scorer.score_given(UnitGels(manifest), rows[has_background])
@@ -157,9 +157,9 @@ class _Scorer:
         """Give rows no score."""
         self._reasons[rows] = reason
 
-    def score_given(self, gels: UnitGels, rows: np.ndarray) -> None:
+    def score_given(self, served: UnitGels, rows: np.ndarray) -> None:
         """Score rows that have a background by the rule."""
-        gel_of_row = gels.shared(UntouchedGel)
+        gel_of_row = served.shared(UntouchedGel)
         self._assign(lambda row: self._score_row(gel_of_row, "given", row), rows)
 
     def score_group(self, group: np.ndarray, backgrounds: Mapping[str, UntouchedGel]) -> None:

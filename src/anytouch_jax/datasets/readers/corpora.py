@@ -440,14 +440,14 @@ def _taxim_presses(index: DatasetIndex) -> None:
             continue
         try:
             with np.load(path, allow_pickle=False) as pack:
-                gel, images, centres, radii = (
+                gel, presses, centres, radii = (
                     pack[key] for key in ("f0", "imgs", "touch_center", "touch_radius")
                 )
         except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
             raise DatasetError(f"{path} is not a calibration pack of taxim: {error}") from None
-        names = [f"press_{i:02d}" for i in range(len(images))]
+        names = [f"press_{i:02d}" for i in range(len(presses))]
         with exported(index, place, sensor, [path]) as pictures:
-            for name, image in zip(("background", *names), (gel, *images), strict=True):
+            for name, image in zip(("background", *names), (gel, *presses), strict=True):
                 pictures.save(f"{name}.png", image[..., ::-1])
         place = pictures.folder
         cells = {"sensor": sensor, "unit": f"taxim/{sensor}", "frame_index": 0}

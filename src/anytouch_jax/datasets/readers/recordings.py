@@ -433,7 +433,7 @@ def _moves_like_film(folders: Sequence[Sequence[Path]]) -> bool:
     for paths in folders:
         starts = np.unique(np.linspace(0, len(paths) - 2, 4).astype(int))
         try:
-            pictures = {
+            decoded = {
                 at: images.decode(paths[at])
                 for at in sorted({*starts.tolist(), *(starts + 1).tolist()})
             }
@@ -443,7 +443,7 @@ def _moves_like_film(folders: Sequence[Sequence[Path]]) -> bool:
         except (images.ImageError, OSError):
             continue
         tiny = {
-            at: cv2.resize(one, _TINY, interpolation=cv2.INTER_AREA) for at, one in pictures.items()
+            at: cv2.resize(one, _TINY, interpolation=cv2.INTER_AREA) for at, one in decoded.items()
         }
         tiny = {at: one.mean(axis=2).astype(np.float32) for at, one in tiny.items()}
         near += [float(np.abs(tiny[at] - tiny[at + 1]).mean()) for at in starts]

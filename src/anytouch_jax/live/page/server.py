@@ -39,7 +39,7 @@ from anytouch_jax.live.examples import EXAMPLE
 from anytouch_jax.live.page.feature_map import FeatureMap
 from anytouch_jax.live.page.layers import LAYERS, SIDE, field_numbers, scale_down
 from anytouch_jax.live.page.runs import Run
-from anytouch_jax.live.page.tables import Table, open_examples, open_film, open_folder, title
+from anytouch_jax.live.page.tables import Table, open_examples, open_video_table, open_folder, title
 
 # Its libraries take seconds to import, and a manifest needs none of them.
 if TYPE_CHECKING:
@@ -124,7 +124,7 @@ def _open_table(path: Path) -> Table:
     if path.suffix.lower() in _TABLES:
         return Table(manifests.read(path), title(path))
     if not path.is_dir():
-        return open_film(path)
+        return open_video_table(path)
     inside = [
         file
         for file in sorted(path.iterdir())

@@ -335,7 +335,7 @@ def open_folder(folder: Path) -> Table:
     )
 
 
-def open_film(film: Path) -> Table:
+def open_video_table(film: Path) -> Table:
     """Return the frames of a film as one recording. Raises UserError if it has none."""
     count = count_frames(film)
     if not count:

@@ -126,15 +126,15 @@ def slide(
     pitch = jnp.asarray(interface.pitch, dtype)
     friction = jnp.asarray(interface.friction, dtype)
     # E* over the gel's plane modulus, as in `mechanics.press`
-    share = 1 / (1 + jnp.asarray(gel.plane, dtype) / jnp.asarray(interface.modulus_object, dtype))
+    gel_part = 1 / (1 + jnp.asarray(gel.plane, dtype) / jnp.asarray(interface.modulus_object, dtype))
     # kPa of traction per mm. Tractions are divided by it, so everything below is in mm.
-    unit = jnp.asarray(gel.plane, dtype) * share / pitch
+    unit = jnp.asarray(gel.plane, dtype) * gel_part / pitch
     plan = grids(pressure.shape)[-1] if fidelity == "fast" else Plan(*pressure.shape)
     times = pressure.shape[0] // plan.rows
     load = _pooled(pressure, times)
     before = _pooled(state.traction, times) / unit * times
     known = known_numbers(gel, interface.pitch, interface.modulus_object)
-    step, part = (pitch, share) if known is None else known
+    step, part = (pitch, gel_part) if known is None else known
     spectra = tangential_spectra(plan, step * times, gel.poisson, gel.thickness, part, dtype)
     apply = _compliance(plan, spectra)
     limit = jnp.where(load > 0, friction * load, 0) / unit * times
@@ -167,7 +167,7 @@ def slide(
     # The compliance is that of gel and object together. The object's part is a half-space's.
     if not is_infinite(interface.modulus_object):
         deep = tangential_spectra(plan, pitch * times, gel.poisson, float("inf"), 1.0, dtype)
-        displacement = displacement - (1 - share) * _compliance(plan, deep)(total)
+        displacement = displacement - (1 - gel_part) * _compliance(plan, deep)(total)
     if not interface.coarse:
         displacement = enlarged(displacement, pressure.shape)
     # A traction is smooth relative to the pressure, which falls to zero at the rim. So the ratio is

@@ -47,7 +47,7 @@ def test_more_frames_of_the_same_recordings_make_no_interval_narrower(measured, 
 
 
 def test_the_components_of_pixels_are_those_of_rows_that_are_not_tested():
-    """Else the control would know the pictures of the test, and the encoder would not."""
+    """Else the control would know the images of the test, and the encoder would not."""
     rng = np.random.default_rng(0)
     count = 48
     groups = np.array([f"thing {number // 4}" for number in range(count)])

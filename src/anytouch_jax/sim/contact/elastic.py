@@ -347,7 +347,7 @@ def _looked_up(far: Any, table: Host, limit: float) -> Any:
 
 
 def normal_spectrum(
-    plan: Plan, pitch: Any, poisson: float, thickness: Any, share: Any, dtype: Any
+    plan: Plan, pitch: Any, poisson: float, thickness: Any, fraction: Any, dtype: Any
 ) -> Array:
     """Return the spectrum (KH, KW) of the normal coefficients.
 
@@ -356,22 +356,22 @@ def normal_spectrum(
         pitch: mm between pixels.
         poisson: Poisson's ratio of the gel.
         thickness: mm of the gel; infinite for a half-space.
-        share: E* over the gel's plane modulus: the part of the motion that is the layer's.
+        fraction: E* over the gel's plane modulus: the part of the motion that is the layer's.
         dtype: Of the spectrum.
     """
     if is_infinite(thickness):
         return jnp.asarray(_normal_host(plan), dtype)
-    xp, kind = _library(dtype, pitch, thickness, share)
+    xp, kind = _library(dtype, pitch, thickness, fraction)
     deep = xp.asarray(_normal_host(plan), kind)
     scale = xp.asarray(pitch / thickness, kind)
     table, _, _ = layer_tables(poisson)
     radius = xp.asarray(_radius(plan), kind) * scale
-    layer = deep - plan.spectrum(share * scale / np.pi * _looked_up(radius, table, 1.0))
+    layer = deep - plan.spectrum(fraction * scale / np.pi * _looked_up(radius, table, 1.0))
     return jnp.asarray(layer, dtype)
 
 
 def tangential_spectra(
-    plan: Plan, pitch: Any, poisson: float, thickness: Any, share: Any, dtype: Any
+    plan: Plan, pitch: Any, poisson: float, thickness: Any, fraction: Any, dtype: Any
 ) -> Array:
     """Return the spectra (3, KH, KW) of the tangential coefficients xx, xy, yy.
 
@@ -379,14 +379,14 @@ def tangential_spectra(
     """
     if is_infinite(thickness):
         return jnp.asarray(_tangential_host(plan, poisson), dtype)
-    xp, kind = _library(dtype, pitch, thickness, share)
+    xp, kind = _library(dtype, pitch, thickness, fraction)
     deep = xp.asarray(_tangential_host(plan, poisson), kind)
     scale = xp.asarray(pitch / thickness, kind)
     _, mean, twofold = layer_tables(poisson)
     radius = xp.asarray(_radius(plan), kind) * scale
     ratio = poisson / (1 - poisson)
-    mean_at = share * scale / np.pi * _looked_up(radius, mean, 1 + ratio / 2)
-    twofold_at = share * scale / np.pi * _looked_up(radius, twofold, ratio / 2)
+    mean_at = fraction * scale / np.pi * _looked_up(radius, mean, 1 + ratio / 2)
+    twofold_at = fraction * scale / np.pi * _looked_up(radius, twofold, ratio / 2)
     cosine, sine = (xp.asarray(table, kind) for table in _twice_the_angle(plan))
     # A motion along x by a load along x varies as cos 2 phi about its mean over directions.
     parts = (mean_at + cosine * twofold_at, sine * twofold_at, mean_at - cosine * twofold_at)

@@ -116,7 +116,7 @@ def press(
     plane = jnp.asarray(gel.plane, dtype)
     # The composite modulus E*, of 1 / E* = 1 / E_gel + 1 / E_object, over the gel's own. It is the
     # part of the approach by which the gel gives way, and not the object.
-    share = 1 / (1 + plane / jnp.asarray(modulus_object, dtype))
+    fraction = 1 / (1 + plane / jnp.asarray(modulus_object, dtype))
     cut = jnp.where(jnp.isfinite(surface), surface + depth, -jnp.ones((), dtype))
     scale = jnp.max(cut)
     scale = jnp.where((scale > 0) & (depth >= 0), scale, 0)
@@ -124,7 +124,7 @@ def press(
     cut = jnp.where(scale > 0, cut / jnp.where(scale > 0, scale, 1), -1)
     plans = grids(surface.shape) if fidelity == "fast" else [Plan(*surface.shape)]
     known = known_numbers(gel, pitch_given, modulus_object)
-    step, part = (pitch, share) if known is None else known
+    step, part = (pitch, fraction) if known is None else known
     compliances = [
         _compliance(plan, step * 2**level, gel, part, dtype) for level, plan in enumerate(plans)
     ]
@@ -134,8 +134,8 @@ def press(
         most = 300 if iterations is None else iterations
         solution, load, moved = _exact(compliances, cut, tolerance, most)
     # both move: the gel's part is the rest
-    moved = moved - _of_object(plans[0], load, share, modulus_object)
-    pressure = solution.x * (scale * plane * share / pitch)
+    moved = moved - _of_object(plans[0], load, fraction, modulus_object)
+    pressure = solution.x * (scale * plane * fraction / pitch)
     force = jnp.sum(pressure) * pitch**2 * KPA_MM2
     converged = solution.residual <= tolerance
     return PressResult(
@@ -191,7 +191,7 @@ def _check_elastic(
 
 
 def known_numbers(gel: Gel, pitch: Any, modulus_object: Any) -> tuple[float, float] | None:
-    """Return pitch and share of a spectrum (`elastic.normal_spectrum`), if no number is traced.
+    """Return pitch and fraction of a spectrum (`elastic.normal_spectrum`), if no number is traced.
 
     With them the spectra of a constant gel are computed by numpy, and not by XLA as it compiles.
     """
@@ -212,14 +212,14 @@ def grids(shape: tuple[int, ...]) -> list[Plan]:
 
 
 def _compliance(
-    plan: Plan, pitch: float | Array, gel: Gel, share: float | Array, dtype: Any
+    plan: Plan, pitch: float | Array, gel: Gel, fraction: float | Array, dtype: Any
 ) -> Compliance:
     """Return the normal displacement by a pressure (H, W), as a function."""
-    spectrum = normal_spectrum(plan, pitch, gel.poisson, gel.thickness, share, dtype)
+    spectrum = normal_spectrum(plan, pitch, gel.poisson, gel.thickness, fraction, dtype)
     return lambda pressure: plan.inverse(plan.even(plan.forward(pressure), spectrum))
 
 
-def _of_object(plan: Plan, pressure: Array, share: Array, modulus_object: Any) -> Any:
+def _of_object(plan: Plan, pressure: Array, fraction: Array, modulus_object: Any) -> Any:
     """Return the object's part of the displacement by a pressure, in units of `cut`.
 
     The object is a half-space.
@@ -227,7 +227,7 @@ def _of_object(plan: Plan, pressure: Array, share: Array, modulus_object: Any) -
     if is_infinite(modulus_object):
         return 0.0
     deep = normal_spectrum(plan, 1.0, 0.0, float("inf"), 1.0, pressure.dtype)
-    return (1 - share) * plan.inverse(plan.even(plan.forward(pressure), deep))
+    return (1 - fraction) * plan.inverse(plan.even(plan.forward(pressure), deep))
 
 
 def _exact(

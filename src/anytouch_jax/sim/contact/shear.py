@@ -126,7 +126,9 @@ def slide(
     pitch = jnp.asarray(interface.pitch, dtype)
     friction = jnp.asarray(interface.friction, dtype)
     # E* over the gel's plane modulus, as in `mechanics.press`
-    gel_part = 1 / (1 + jnp.asarray(gel.plane, dtype) / jnp.asarray(interface.modulus_object, dtype))
+    gel_part = 1 / (
+        1 + jnp.asarray(gel.plane, dtype) / jnp.asarray(interface.modulus_object, dtype)
+    )
     # kPa of traction per mm. Tractions are divided by it, so everything below is in mm.
     unit = jnp.asarray(gel.plane, dtype) * gel_part / pitch
     plan = grids(pressure.shape)[-1] if fidelity == "fast" else Plan(*pressure.shape)
@@ -267,7 +269,7 @@ def _totals(
 ) -> tuple[Array, Array, Array]:
     """Return force, torque about the centre of pressure, and the slipping part of the contact.
 
-    They are (2,) N, N mm, and a share of the contact's area.
+    They are (2,) N, N mm, and a fraction of the contact's area.
     """
     x, y = positions((pressure.shape[0], pressure.shape[1]), pitch)
     middle = centroid(pressure, pitch)

@@ -659,7 +659,7 @@ def _exchange(
         result = _empty_cells(result, "background_path", rgb_images)
         done.append(
             f"emptied background_path in {int(rgb_images.sum())} of them: it lay among the "
-            "photographs"
+            "RGB images"
         )
     return result, exchanged
 

@@ -331,7 +331,7 @@ assert main(["--help"]) == 0
 ours = [name for name in sys.modules if name.startswith("anytouch_jax.")]
 known = ("anytouch_jax.cli", "anytouch_jax.config", "anytouch_jax.doors", "anytouch_jax.errors",
          "anytouch_jax.sensors", "anytouch_jax.signals", "anytouch_jax.text",
-         "anytouch_jax.shown")
+         "anytouch_jax.shown", "anytouch_jax.renamed")
 assert not [name for name in ours if not name.startswith(known)], ours
 assert not [name for name in ours if name.startswith("anytouch_jax.cli.")
             and name.rpartition(".")[2] not in ("app", "arguments")], ours

@@ -133,7 +133,7 @@ def test_a_video_has_the_rate_of_its_recording(frames, weights, monkeypatch):
     write_video("slow.avi", images, 12)
     lines = Path("manifest.csv").read_text().splitlines()
     stamps = ["timestamp", *(f"{0.05 * number}" for number in range(5)), "0"]
-    Path("timed.csv").write_text("\n".join(map(",".aggregation, zip(lines, stamps, strict=True))))
+    Path("timed.csv").write_text("\n".join(map(",".join, zip(lines, stamps, strict=True))))
     for data, rate in (("slow.avi", 12), ("frames", 30), ("manifest.csv", 30), ("timed.csv", 20)):
         sensor = [] if data.endswith(".csv") else ["--sensor", "digit"]
         more = ["--data", data, "--out", "out.npz", "--video", "shown.avi"]

@@ -118,7 +118,7 @@ def test_pixels_are_square_as_the_video_is_meant_to_be_shown(tmp_path, codec, de
 @pytest.mark.parametrize("codec", CODECS)
 @pytest.mark.parametrize("ending", ["mp4", "mkv"])
 def test_time_counts_from_the_start_of_a_video(tmp_path, codec, ending):
-    path = encoded(tmp_path / f"film.{ending}", codec, start=50)
+    path = encoded(tmp_path / f"video.{ending}", codec, start=50)
     times = [time for time, _ in images.timed_frames(path)]
     assert times == pytest.approx([0, 0.1, 0.2, 0.3], abs=0.01)
 
@@ -171,19 +171,19 @@ def test_names_that_are_not_utf_8_are_read(tmp_path, kind):
 
 def test_a_video_is_written_under_a_name_that_is_not_utf_8(tmp_path):
     """In a process of its own, for the same reason."""
-    name = os.fsencode(tmp_path) + b"/gr\xfcn/film.mp4"
+    name = os.fsencode(tmp_path) + b"/gr\xfcn/video.mp4"
     code = (
         "import os, sys\n"
         "from pathlib import Path\n"
         "import numpy as np\n"
         "from anytouch_jax.data.images import frames_from_video\n"
-        "from anytouch_jax.fields.film import Video\n"
+        "from anytouch_jax.fields.video import Video\n"
         "path = Path(os.fsdecode(bytes.fromhex(sys.argv[1])))\n"
         "path.parent.mkdir()\n"
         "video = Video(path)\n"
         "for grey in (50, 100, 150):\n"
         "    video.add(np.full((64, 64, 3), grey, np.uint8))\n"
-        "film.finish()\n"
+        "video.finish()\n"
         "print([int(round(frame.mean(), -1)) for frame in frames_from_video(path)])\n"
         "print([file.name for file in path.parent.iterdir()])\n"
     )

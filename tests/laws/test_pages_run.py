@@ -27,7 +27,7 @@ from places import ROOT
 from reader_world import fill_ycb
 from runs import SIZES
 from tiny_models import tiny_config
-from touch_world import image, make_touches, tint
+from touch_world import make_touches, render, tint
 
 import anytouch_jax as at
 from anytouch_jax.cli.app import main
@@ -128,7 +128,7 @@ def make_recordings(file: Path) -> None:
             split = "train" if number < 7 else "val" if number < 9 else "test"
             for sensor in ("digit", "gelsight"):
                 for frame in range(4):
-                    pixels = image(
+                    pixels = render(
                         texture, place, 2 + 2 * frame, tint(("digit", "gelsight"), sensor), 32
                     )
                     path = f"{thing}{number}_{sensor}_{frame}.png"

@@ -443,7 +443,7 @@ class AnnotateOptions:
     sheet_count: Count[int] = 40  # Captions on that page.
     split: str | None = None  # Only rows of this split.
     family: tuple[tuple[str, Literal["photograph", "object", "phrase"]], ...] = ()
-    """Prompt of your dataset, as in: mydata RGB image."""
+    """Prompt of your dataset, as in: mydata photograph."""
     second_image: str = "image2_path"  # Column of a second RGB image, for the prompt object.
     overwrite: bool = False  # Also ask for rows that have a caption.
     threads: Threads = 4  # Questions at a time.

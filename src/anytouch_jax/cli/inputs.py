@@ -63,9 +63,8 @@ class FrameOptions(SensorOptions):
     """Features: the class token, the mean of the patch tokens, or both (default: that of --head,
     else class).
     """
-    aggregation: Literal["mean", "sum", "concat"] = (
-        "mean"  # How the segments of a long clip are joined.
-    )
+    aggregation: Literal["mean", "sum", "concat"] = "mean"
+    """How the segments of a long clip are joined."""
     dtype: Literal["trained", "float32", "bfloat16"] = "trained"
     """Arithmetic: that of training, or another. Use bfloat16 on GPUs and CPUs with AMX."""
     engine: Literal["auto", "xla", "onnxruntime", "openvino"] = "auto"

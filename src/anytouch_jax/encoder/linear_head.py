@@ -186,7 +186,7 @@ def save_head(path: str | Path, head: LinearHead) -> None:
     """Write a head as `.npz` atomically. Raises OSError."""
     arrays = dict(vars(head))
     known = arrays.pop("calibration")
-    images = arrays.pop("gels")
+    images = arrays.pop("backgrounds")
     # Files name the fingerprint "mark" since the first version.
     arrays = {"mark" if name == "fingerprint" else name: value for name, value in arrays.items()}
     arrays |= background_arrays(images)

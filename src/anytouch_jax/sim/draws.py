@@ -18,6 +18,7 @@ import numpy.typing as npt
 from scipy.stats import gamma as gamma_distribution
 
 Leaf = npt.NDArray[Any] | jax.Array  # numpy, or jax under vmap and jit
+Scalar = float | np.integer[Any] | Leaf  # one number, known or traced
 Size = int | tuple[int, ...]
 
 

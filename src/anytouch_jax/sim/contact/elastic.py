@@ -23,6 +23,9 @@ import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 from jax import Array
+from jax.typing import DTypeLike
+
+from anytouch_jax.sim.draws import Scalar
 
 Host = npt.NDArray[np.float64]
 
@@ -146,7 +149,7 @@ def _kernel_table(size: int, padded: int, parity: int, weighted: bool) -> Host:
     return table
 
 
-def _waves(padded: int, dtype: Any) -> Array:
+def _waves(padded: int, dtype: DTypeLike) -> Array:
     return jnp.asarray(_wave_table(padded), dtype)
 
 
@@ -302,7 +305,9 @@ def sideways_table(poisson: float) -> tuple[Host, float]:
     return bessel0 @ (weights * smooth), rest
 
 
-def sideways_kernel(plan: Plan, pitch: Any, poisson: float, thickness: Any, dtype: Any) -> Any:
+def sideways_kernel(
+    plan: Plan, pitch: Scalar, poisson: float, thickness: Scalar, dtype: DTypeLike
+) -> Any:
     """Return the potential of the sideways motion of a layer's surface by a load on a pixel.
 
     Its gradient is that motion. It is (H, W) at offsets >= 0, in units of P / (pi E*). A load pulls
@@ -317,7 +322,7 @@ def sideways_kernel(plan: Plan, pitch: Any, poisson: float, thickness: Any, dtyp
     return xp.where(far < FAR, _between(far, table) + rest * xp.arcsinh(2 / far), 0)
 
 
-def _library(dtype: Any, *values: Any) -> tuple[ModuleType, Any]:
+def _library(dtype: DTypeLike, *values: Any) -> tuple[ModuleType, Any]:
     """Return the array library that computes with some values, and the type of its numbers.
 
     Values that are known before a program runs are for numpy, in float64. XLA would compute with
@@ -347,7 +352,7 @@ def _looked_up(far: Any, table: Host, limit: float) -> Any:
 
 
 def normal_spectrum(
-    plan: Plan, pitch: Any, poisson: float, thickness: Any, fraction: Any, dtype: Any
+    plan: Plan, pitch: Scalar, poisson: float, thickness: Scalar, fraction: Scalar, dtype: DTypeLike
 ) -> Array:
     """Return the spectrum (KH, KW) of the normal coefficients.
 
@@ -371,7 +376,7 @@ def normal_spectrum(
 
 
 def tangential_spectra(
-    plan: Plan, pitch: Any, poisson: float, thickness: Any, fraction: Any, dtype: Any
+    plan: Plan, pitch: Scalar, poisson: float, thickness: Scalar, fraction: Scalar, dtype: DTypeLike
 ) -> Array:
     """Return the spectra (3, KH, KW) of the tangential coefficients xx, xy, yy.
 

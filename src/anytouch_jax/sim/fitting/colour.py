@@ -127,7 +127,8 @@ def _profiles(ball_mm: float) -> dict[_Key, _Profiles]:
 
     found = dict[_Key, _Profiles]()
     for thickness in THICKNESSES:
-        gel = Gel(150.0, thickness=np.float32(thickness))
+        # An array, so that one compiled program serves all thicknesses.
+        gel = Gel(150.0, thickness=np.asarray(thickness, np.float32))
         dents = np.asarray(solve(DEPTHS.astype(np.float32), gel))
         _, slope = lines(dents, SKIN)
         for halo in HALOS:

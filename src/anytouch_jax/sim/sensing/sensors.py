@@ -85,6 +85,7 @@ def _simulated(name: str, **appearance: Any) -> Sensor:
     """Return the simulated form of a sensor: its record, and how it looks."""
     record = RECORDS[name]
     assert record.size_mm is not None and record.pixels is not None
+    assert record.modulus_kpa is not None and record.thickness_mm is not None
     return Sensor(
         name,
         record.size_mm,

@@ -77,7 +77,7 @@ def test_numpy_files_are_containers_too(tmp_path):
         np.testing.assert_array_equal(decode(tmp_path / path), FRAMES[4])
 
 
-def test_files_of_pictures_are_handed_on_as_they_are(tmp_path):
+def test_files_of_images_are_handed_on_as_they_are(tmp_path):
     path = tmp_path / "a.h5"
     with h5py.File(path, "w") as file:
         lengths = file.create_dataset("varying", (7,), h5py.vlen_dtype(np.uint8))
@@ -135,7 +135,7 @@ def test_vectors_and_matrices_are_no_frames(tmp_path):
             file[key] = array
     with open_container(tmp_path / "a.h5") as opened:
         forms = {one.key: one.form for one in opened.fields()}
-    assert forms.pop("points").single, "it could be a picture, so it is one of floats"
+    assert forms.pop("points").single, "it could be an image, so it is one of floats"
     assert set(forms.values()) == {None}
 
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from anytouch_jax.data.images import ImageError, decode, list_images, picture_files
+from anytouch_jax.data.images import ImageError, decode, image_files, list_images
 from anytouch_jax.data.stacks import read_stack, stacked_frames
 
 RNG = np.random.default_rng(0)
@@ -29,13 +29,13 @@ def test_every_frame_of_a_stack_is_read(tmp_path, form):
         np.testing.assert_array_equal(np.stack(frames_of(tmp_path / name)), wanted)
 
 
-def test_one_picture_and_other_files_are_no_stack(tmp_path):
+def test_one_image_and_other_files_are_no_stack(tmp_path):
     np.save(tmp_path / "one.npy", FRAMES[0])
     np.save(tmp_path / "grey.npy", FRAMES[0, ..., 0])
-    (tmp_path / "film.mp4").write_bytes(b"")
-    for name in ("one.npy", "grey.npy", "film.mp4", "gone.npy", "."):
+    (tmp_path / "video.mp4").write_bytes(b"")
+    for name in ("one.npy", "grey.npy", "video.mp4", "gone.npy", "."):
         assert read_stack(tmp_path / name) is None
-    np.savez(tmp_path / "one.npz", picture=FRAMES[0])
+    np.savez(tmp_path / "one.npz", image=FRAMES[0])
     assert len(frames_of(tmp_path / "one.npz")) == 1
 
 
@@ -78,7 +78,7 @@ def test_a_folder_of_stacks_is_a_folder_of_their_frames(tmp_path):
     np.testing.assert_array_equal(np.stack([decode(file) for file in files[:9]]), FRAMES[3:])
     np.testing.assert_array_equal(np.stack([decode(file) for file in files[9:]]), FRAMES[:3])
     assert list(named) == ["background"]
-    assert picture_files(tmp_path / "touch_10.npz") == files[9:]
+    assert image_files(tmp_path / "touch_10.npz") == files[9:]
     np.savez(tmp_path / "two.npz", left=FRAMES, right=FRAMES)
     with pytest.raises(ImageError, match=r"two\.npz has 2 arrays of frames: left, right"):
         list_images(tmp_path)

@@ -6,7 +6,7 @@ A frame of such a file has a path of its own in a manifest, and stays where it i
 * `replay.zarr/data/camera0_rgb/17`, the same of a folder `.zarr` or a file `.zarr.zip`.
 * `press.npz/frames/17` and `press.npy/17` are frames of a NumPy file.
 
-Frames are pixels (u8, u16 or floats; channels last, first or none), or files of pictures (JPEG,
+Frames are pixels (u8, u16 or floats; channels last, first or none), or files of images (JPEG,
 PNG) in bytes, which are handed on as they are.
 
 Such files come from strangers, so what a format can do beyond holding arrays is refused: HDF5 may
@@ -30,8 +30,8 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from anytouch_jax.data.image_headers import JPEG, PNG
 from anytouch_jax.data.names import natural
-from anytouch_jax.data.picture_headers import JPEG, PNG
 from anytouch_jax.data.pixels import check_shape
 from anytouch_jax.doors import lacking
 from anytouch_jax.errors import UserError
@@ -46,13 +46,13 @@ _ROW = re.compile(
     r"(.+?\.(?:h5|hdf5|hdf|he5|zarr|zarr\.zip|npy|npz))/(?:(.+)/)?(\d+)", re.IGNORECASE
 )
 _CHANNELS = (1, 3, 4)
-_SMALLEST = 8  # pixels of a side: a smaller array is a vector or a matrix, not a picture
+_SMALLEST = 8  # pixels of a side: a smaller array is a vector or a matrix, not an image
 # Bytes of a chunk, and of all chunks in memory. A chunk is unpacked as a whole, so a small file
 # could fill the memory.
 _MOST = 1 << 29
 _MOST_ARRAYS = 200_000  # of a file
 _LOOKED_AT = 5  # frames of floats that tell whether they count to 1 or to 255
-_PICTURE_STARTS = (JPEG, PNG)
+_IMAGE_STARTS = (JPEG, PNG)
 # Codecs of zarr that only compress, or order bytes. Others are refused: `pickle` runs code.
 _CODECS = {
     "blosc", "zlib", "gzip", "zstd", "lz4", "lzma", "bz2", "bytes", "transpose", "crc32", "crc32c",
@@ -69,8 +69,8 @@ class Form(NamedTuple):
     """How an array holds frames."""
 
     frames: int
-    layout: str  # HWC, CHW, HW, or "files" for pictures in bytes
-    height: int = 0  # 0 where only the pictures tell
+    layout: str  # HWC, CHW, HW, or "files" for images in bytes
+    height: int = 0  # 0 where only the images tell
     width: int = 0
     single: bool = False  # the array is one frame, without an axis of frames
 
@@ -224,7 +224,7 @@ def open_container(path: Path) -> Container:
 
 
 def stack_rows(path: Path) -> dict[str, list[Path]] | None:
-    """Return the paths of the frames in a .npy or .npz file by array, None for one picture in .npy.
+    """Return the paths of the frames in a .npy or .npz file by array, None for one image in .npy.
 
     A file without frames has none. Raises ContainerError for a damaged file.
     """
@@ -243,14 +243,14 @@ def _stacks_among(forms: dict[str, Form], names: Collection[str]) -> dict[str, F
     """Return which arrays of a NumPy file are the frames, among those that could be some.
 
     Maps of depth, without channels, lie beside frames with channels, and rows of features or
-    forces have the form of one grey picture.
+    forces have the form of one grey image.
     """
     if {"features", "rows"} <= set(names):
         return {}
     with_channels = {key: form for key, form in forms.items() if form.layout != "HW"}
     stacks = {key: form for key, form in forms.items() if not form.single}
     coloured = {key: form for key, form in stacks.items() if key in with_channels}
-    # An .npz of one picture is a stack of one.
+    # An .npz of one image is a stack of one.
     return coloured or stacks or (with_channels if len(with_channels) == 1 else {})
 
 
@@ -389,7 +389,7 @@ def _form_of(stored: Stored, is_mixed: bool) -> Form | None:
 
 
 def _frames_form(sides: tuple[int, ...], frames: int, least: int) -> Form | None:
-    """Return the form of pictures with three sides of `least` pixels, channels last or first."""
+    """Return the form of images with three sides of `least` pixels, channels last or first."""
     if sides[2] in _CHANNELS and min(sides[:2]) >= least:
         return Form(frames, "HWC", sides[0], sides[1])
     if sides[0] in _CHANNELS and min(sides[1:]) >= least:
@@ -406,7 +406,7 @@ def _form_of_files(stored: Stored, shape: tuple[int, ...], *, is_vector: bool) -
         first = file_bytes(stored[0] if axes else stored[()])
     except Exception:  # a damaged value; it is reported where it is used
         return None
-    if not first.startswith(_PICTURE_STARTS):
+    if not first.startswith(_IMAGE_STARTS):
         return None
     return Form(shape[0] if axes else 1, "files", single=not axes)
 
@@ -508,7 +508,7 @@ class Frames:
         return 255.0 if 1 < highest <= 255 else 1.0
 
     def file(self, row: int) -> bytes:
-        """Return a frame as the bytes of a file: the stored picture, or pixels as .npy."""
+        """Return a frame as the bytes of a file: the stored image, or pixels as .npy."""
         if not 0 <= row < self.form.frames:
             raise ContainerError(
                 f"{self._name} has {self.form.frames} frames, no frame {row}; index the data again"

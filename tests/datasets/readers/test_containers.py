@@ -221,7 +221,7 @@ def recordings_of(path, arrays):
         ([f"cam_{n}/rgb" for n in range(5)], {f"cam_{n}" for n in range(5)}, None),
         (["o_1/trial_2/rgb", "o_1/trial_3/rgb"], {"o_1/trial_2", "o_1/trial_3"}, None),
         (["press_a/touch", "press_b/touch"], {"press_a", "press_b"}, None),
-        # before and after are single pictures, and numbers count frames
+        # before and after are single images, and numbers count frames
         (["g/before_still", "g/after_still"], {"a.h5"}, {"g/before_still": 1, "g/after_still": 1}),
         ([f"touch/{n}" for n in (0, 2, 10)], {"a.h5"}, {"touch": 3}),
         ([f"demo_1/tactile/{n}" for n in (0, 2)], {"demo_1"}, {"demo_1/tactile": 2}),
@@ -234,7 +234,7 @@ def test_what_is_a_recording_and_what_a_camera(tmp_path, arrays, episodes, seque
         assert counts == sequences
 
 
-def test_numbers_of_single_pictures_are_numbers_of_frames(tmp_path):
+def test_numbers_of_single_images_are_numbers_of_frames(tmp_path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         for number in (10, 2, 0):
             file[f"touch/frame_{number:04d}"] = frames(1, number)[0]

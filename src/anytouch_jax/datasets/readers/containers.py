@@ -56,7 +56,7 @@ class CameraArrays(NamedTuple):
         key: Its path inside the recording.
         form: How its first array holds frames.
         frames: (number, array, row) of every frame.
-        background: The path of a picture of the untouched gel: array and row.
+        background: The path of an image of the untouched gel: array and row.
     """
 
     key: str
@@ -184,7 +184,7 @@ def _without_number(name: str) -> str:
 def _cameras(images: Sequence[ArrayInfo], place: str) -> list[CameraArrays]:
     """Return the cameras of a recording.
 
-    Single pictures in one group whose names are numbers, as frames/17, are frames of one camera.
+    Single images in one group whose names are numbers, as frames/17, are frames of one camera.
     """
     found: dict[str, list[tuple[int, str, int]]] = {}
     first: dict[str, ArrayInfo] = {}
@@ -231,7 +231,7 @@ def _own(backgrounds: dict[str, tuple[str, int]], key: str) -> tuple[str, int] |
 
 
 def _group_of_numbers(one: ArrayInfo) -> str | None:
-    """Return the group of a single picture whose name is a number of 18 digits at most."""
+    """Return the group of a single image whose name is a number of 18 digits at most."""
     group, _, name = one.key.rpartition("/")
     if one.form is not None and one.form.single and re.fullmatch(r"\D{0,8}\d{1,18}", name):
         return group

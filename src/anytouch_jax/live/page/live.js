@@ -144,7 +144,7 @@ function showLive(source, about) {
   const show = async (one, jpeg) => {
     if (one.error) { say(one.error, true); return; }
     const bitmap = await createImageBitmap(new Blob([jpeg], { type: "image/jpeg" }));
-    showLayer(canvas, bitmap, one.layer === "surface");
+    showLayer(canvas, bitmap, one.layer === "surface" ? one.fields : null);
     bitmap.close();
     const age = performance.timeOrigin + performance.now() - one.grabbed;
     ages.push(age);
@@ -182,7 +182,9 @@ function showLive(source, about) {
   const read = guard(async () => {
     stopped.abort();
     stopped = new AbortController();
-    const reader = (await api(`${source}/stream?layer=${state.layer}`, { signal: stopped.signal })).body.getReader();
+    // A picture has no more pixels than are shown: the browser decodes each of them.
+    const side = Math.round((window.devicePixelRatio || 1) * Math.max(canvas.clientWidth, canvas.clientHeight)) || 640;
+    const reader = (await api(`${source}/stream?layer=${state.layer}&side=${side}`, { signal: stopped.signal })).body.getReader();
     let data = new Uint8Array(0), newest = null, drawing = false;
     const draw = guard(async () => { // while one is decoded, others arrive: only the newest is drawn next
       drawing = true;

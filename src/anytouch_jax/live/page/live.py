@@ -16,6 +16,7 @@ from anytouch_jax.errors import UserError
 from anytouch_jax.live.cameras import CameraSettings, LoopedFilm, open_source
 from anytouch_jax.live.examples import EXAMPLE, ExampleCamera
 from anytouch_jax.live.page.frames import FrameReader
+from anytouch_jax.live.page.layers import SIDE
 from anytouch_jax.live.page.naming import NearestTouches, name_touch
 from anytouch_jax.live.page.packet import Shown, describe_touch, layers_of, packet
 from anytouch_jax.live.page.recorder import LiveRecorder
@@ -116,8 +117,8 @@ class Live:
     def _head_in_use(self) -> LinearHead | None:
         return self.teacher.head or self._head
 
-    async def packets(self, layer: str) -> AsyncIterator[bytes]:
-        """Yield each newest frame as a layer (see `packet`).
+    async def packets(self, layer: str, side: int = SIDE) -> AsyncIterator[bytes]:
+        """Yield each newest frame as a layer, with a long side of `side` pixels (see `packet`).
 
         Between frames it takes no thread: the server has 40, and a page that is left open keeps its
         stream.
@@ -129,7 +130,7 @@ class Live:
                 await asyncio.sleep(_LOOK)
             else:
                 seen = newest.number
-                yield await asyncio.to_thread(packet, newest, layer)
+                yield await asyncio.to_thread(packet, newest, layer, side)
 
     def _run(self, source: Any) -> None:
         """Show what a source gives, up to its end: the camera's thread."""

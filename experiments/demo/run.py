@@ -14,7 +14,6 @@ import time
 from functools import partial
 from pathlib import Path
 
-import jax
 import numpy as np
 
 from anytouch_jax.encoder.encoder import Encoder, load_encoder
@@ -23,12 +22,20 @@ from anytouch_jax.progress import tracked
 from anytouch_jax.train.mesh import enable_compilation_cache
 from experiments.demo.report import PACKAGE, Findings, first_report, write_findings
 from experiments.demo.touches import NAMES, Touches, simulate, write_ring_light
-from experiments.demo.training import Learner, shown, train_course, with_head
+from experiments.demo.training import (
+    FRESH_RATE,
+    RATE,
+    Learner,
+    from_nothing,
+    shown,
+    train_course,
+    with_head,
+)
 
-TRAIN = 768  # touches
-TEST = 384
+TRAIN = 1536  # touches
+TEST = 512
 SMALL = 4  # pixels that are averaged along each side for the head on pixels
-PENALTIES = (100.0,)  # of that head, which has many more numbers than touches
+COMPONENTS = 192  # of the pixels: as many as features of the encoder
 
 
 def pixel_names(learner: Learner, train: Touches, test: Touches) -> np.ndarray:
@@ -38,9 +45,8 @@ def pixel_names(learner: Learner, train: Touches, test: Touches) -> np.ndarray:
     x = np.concatenate(rows)
     side = x.shape[1] // SMALL
     x = x.reshape(len(x), side, SMALL, side, SMALL, 3).mean((2, 4)).reshape(len(x), -1)
-    # As many principal components as features of the encoder: the fit then takes no time.
     middle = x[:count].mean(0)
-    axes = np.linalg.svd(x[:count] - middle, full_matrices=False)[2][:192]
+    axes = np.linalg.svd(x[:count] - middle, full_matrices=False)[2][:COMPONENTS]
     x = (x - middle) @ axes.T
     x /= x[:count].std()
     head = next(discriminant_path(x[:count], train.shape, len(NAMES), [1.0]))
@@ -86,13 +92,11 @@ def main() -> None:
     say("depth and force are measured")
     course = partial(train_course, learner, data=(train, test), log=say)
     say(f"training {PACKAGE}")
-    package = course(
-        with_head(learner, encoder.params["touch"], train), seconds=60 * options.minutes
-    )
+    params = with_head(learner, encoder.params["touch"], train)
+    package = course(params, rate=RATE, seconds=60 * options.minutes)
     say("training the same network from nothing")
-    fresh = encoder.net.init(jax.random.key(0))["touch"]
     steps = package.points[-1].step
-    nothing = course(with_head(learner, fresh, train), seconds=None, steps=steps)
+    nothing = course(from_nothing(learner), rate=FRESH_RATE, steps=steps)
     found = Findings(
         test,
         package,

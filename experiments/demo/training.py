@@ -20,10 +20,14 @@ from anytouch_jax.sim.preparation import augmented, prepared
 from experiments.demo.touches import NAMES, Touches
 
 BATCH = 32
-RATE = 3e-4  # of the encoder, falling to 0
-HEAD_RATE = 3e-3
+# Learning rates of the encoder: one that knows touch is moved less than one from nothing.
+RATE = 1e-4
+FRESH_RATE = 5e-4
+HEAD_RATE = 1e-3
+WARM_UP = 0.1  # of the steps, before the rates fall to 0
+TIMED = 4  # steps whose speed decides how many there are
 POINTS = 6  # of the curve, after the first one
-FIRST_PENALTY = 1.0  # of the head before training, in variances of a feature
+PENALTY = 1.0  # of the head before training, in variances of a feature
 Params = dict[str, Any]
 
 
@@ -55,8 +59,9 @@ class Learner(NamedTuple):
 
     def logits(self, params: Params, clip: Any) -> jax.Array:
         """Return logits (n, shapes) of prepared touches."""
-        x = (self.features(params["touch"], clip) - params["mean"]) / params["deviation"]
-        return x @ params["head"]["weights"] + params["head"]["bias"]
+        x = self.features(params["touch"], clip) - params["mean"][None]
+        x = x / params["deviation"][None]
+        return x @ params["head"]["weights"] + params["head"]["bias"][None]
 
     def loss(self, train: Params, fixed: Params, batch: Any, key: Any) -> jax.Array:
         """Return the cross-entropy of a batch (frames, backgrounds, shapes) in other light."""
@@ -97,8 +102,7 @@ def with_head(learner: Learner, touch: Params, train: Touches) -> Params:
     x = in_batches(partial(encode, touch), shown(learner, train))
     mean = x.mean(0)
     deviation = x.std(0) + 1e-6
-    rows = (x - mean) / deviation
-    head = next(discriminant_path(rows, train.shape, len(NAMES), [FIRST_PENALTY]))
+    head = next(discriminant_path((x - mean) / deviation, train.shape, len(NAMES), [PENALTY]))
     return {
         "touch": touch,
         "head": {"weights": jnp.asarray(head.weights), "bias": jnp.asarray(head.bias)},
@@ -107,12 +111,27 @@ def with_head(learner: Learner, touch: Params, train: Touches) -> Params:
     }
 
 
+def from_nothing(learner: Learner, seed: int = 0) -> Params:
+    """Return the same network with random parameters, and a head that knows nothing.
+
+    Its features hardly differ between touches yet, so no statistics of them are of use.
+    """
+    width = learner.net.model.embed
+    return {
+        "touch": learner.net.init(jax.random.key(seed))["touch"],
+        "head": {"weights": jnp.zeros((width, len(NAMES))), "bias": jnp.zeros(len(NAMES))},
+        "mean": jnp.zeros(width),
+        "deviation": jnp.ones(width),
+    }
+
+
 def train_course(
     learner: Learner,
     params: Params,
     data: tuple[Touches, Touches],
     *,
-    seconds: float | None,
+    rate: float,
+    seconds: float | None = None,
     steps: int | None = None,
     log: Callable[[str], None],
 ) -> Course:
@@ -122,6 +141,7 @@ def train_course(
         learner: The network.
         params: Of `with_head`.
         data: Touches of train and of test.
+        rate: The highest learning rate of the encoder.
         seconds: Time of training, by which a first few steps decide how many there are.
         steps: How many there are, if that is known.
         log: Gets one sentence at a time.
@@ -129,19 +149,18 @@ def train_course(
     train, test = data
     fixed = {name: params[name] for name in ("mean", "deviation")}
     state = {name: params[name] for name in ("touch", "head")}
-    rate = optax.inject_hyperparams(optax.adam)(learning_rate=1.0, b2=0.99)
-    tx = optax.chain(optax.clip_by_global_norm(1.0), rate)
+    tx = optax.chain(optax.clip_by_global_norm(1.0), optax.scale_by_adam(b2=0.99))
     moments = tx.init(state)
     held = shown(learner, test)
     score = jax.jit(learner.logits)
 
     @jax.jit
-    def step(state: Params, moments: Any, batch: Any, key: Any, left: Any) -> Any:
+    def step(state: Params, moments: Any, batch: Any, key: Any, factor: Any) -> Any:
         loss, slope = jax.value_and_grad(learner.loss)(state, fixed, batch, key)
         change, moments = tx.update(slope, moments, state)
         change = {
-            "touch": jax.tree.map(lambda one: RATE * left * one, change["touch"]),
-            "head": jax.tree.map(lambda one: HEAD_RATE * left * one, change["head"]),
+            "touch": jax.tree.map(lambda one: -rate * factor * one, change["touch"]),
+            "head": jax.tree.map(lambda one: -HEAD_RATE * factor * one, change["head"]),
         }
         return optax.apply_updates(state, change), moments, loss
 
@@ -155,23 +174,29 @@ def train_course(
     points = [tested(0, 0.0)]
     rng = np.random.default_rng(0)
     spent = 0.0
-    timed = 4
     number = 0
-    left = 1.0
     while steps is None or number < steps:
         rows = rng.choice(len(train.shape), BATCH, replace=False)
         batch = (train.frame[rows], train.background[rows], train.shape[rows])
         begun = time.monotonic()
         key = jax.random.fold_in(jax.random.key(1), number)
-        state, moments, loss = step(state, moments, batch, key, np.float32(left))
+        factor = np.float32(_factor(number, steps))
+        state, moments, loss = step(state, moments, batch, key, factor)
         jax.block_until_ready(loss)
         number += 1
         if number > 1:  # the first one was compiled
             spent += time.monotonic() - begun
-        if steps is None and number == timed:
+        if steps is None and number == TIMED:
             assert seconds is not None
-            steps = max(2 * POINTS, round(seconds * (timed - 1) / spent))
-        left = 1.0 if steps is None else 1 - number / steps
+            steps = max(2 * POINTS, round(seconds * (TIMED - 1) / spent))
         if steps is not None and number * POINTS // steps > (number - 1) * POINTS // steps:
             points.append(tested(number, spent))
     return Course(points, state | fixed)
+
+
+def _factor(number: int, steps: int | None) -> float:
+    """Return the factor on the learning rates at a step: a warm-up, then a fall to 0."""
+    if steps is None:  # the first few are timed
+        return 0.1
+    done = number / steps
+    return min((done + 0.01) / WARM_UP, 1 - done)

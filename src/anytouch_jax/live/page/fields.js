@@ -79,21 +79,21 @@ function drawSurface(canvas) {
 
 // A bar along the plate's front edge, and one of a whole scale on its corner, in mm.
 function drawScale(g, { width, height, whole, unit, wideMm }, place) {
-  const side = height / width / 2, along = wideMm ? 5 / wideMm : 0.25, corner = [-0.5, side];
+  const side = height / width / 2, along = wideMm ? 5 / wideMm : 0.25, corner = [-0.5, side], style = getComputedStyle(document.body);
   const bar = (from, to, text, shift) => {
     const [a, b] = [place(...from), place(...to)];
-    g.strokeStyle = g.fillStyle = "#e8eaec";
+    g.strokeStyle = g.fillStyle = style.getPropertyValue("--text");
     g.lineWidth = 3;
     g.beginPath();
     g.moveTo(a[0], a[1]);
     g.lineTo(b[0], b[1]);
     g.stroke();
     g.font = "15px system-ui, sans-serif";
-    g.shadowColor = "#000";
-    g.shadowBlur = 4;
     const u = Math.min(VIEW[0] - 62, Math.max(6, (a[0] + b[0]) / 2 + shift[0])), v = Math.min(VIEW[1] - 6, Math.max(18, (a[1] + b[1]) / 2 + shift[1]));
+    g.lineWidth = 4;
+    g.strokeStyle = style.backgroundColor;
+    g.strokeText(text, u, v);
     g.fillText(text, u, v);
-    g.shadowBlur = 0;
   };
   if (wideMm) bar([...corner, 0], [corner[0] + along, corner[1], 0], "5 mm", [-14, 22]);
   bar([...corner, 0], [...corner, LIFT], `${unit === "mm" ? whole : whole.toFixed(3)} ${unit}`, [8, -4]);

@@ -2,6 +2,7 @@
 // Live touch, and a classifier that is taught by touching.
 
 const KEPT_LIVE = 300, HELD = 400; // points of a live curve, ms from which a pressed button was held
+const CURVES = 100, WORDS = 300; // ms between drawings of the curves, and between changes of words, which people read
 
 const percent = (share) => `${Math.round(100 * share)} %`;
 
@@ -29,7 +30,7 @@ function showLive(source, about) {
   const facts = el("div", { className: "facts" }), near = el("div", { className: "thumbs" }), nearest = el("div", { className: "thumbs" });
   const force = forceBar(), pictures = about.table === null ? null : framesOf(about.table, "frame", true);
   const ages = [], scores = {}, boxes = {}, view = { rotate: 0, flip: "none" };
-  let stopped = new AbortController(), shownNear = "", done = null, recording = false, pressed = 0, taught = -1, trained = false, orders = Promise.resolve();
+  let drawnAt = 0, toldAt = 0, stopped = new AbortController(), shownNear = "", done = null, recording = false, pressed = 0, taught = -1, trained = false, orders = Promise.resolve();
   let recorded = new Pictures(`${source}/recorded`, "frame", true);
   const fact = (name, value, kind = "") => {
     boxes[name] ??= facts.appendChild(el("div", { className: "fact" }, name, el("b")));
@@ -153,9 +154,14 @@ function showLive(source, about) {
     main.dataset.frames = Number(main.dataset.frames ?? 0) + 1;
     if (one.taught !== taught) { taught = one.taught; learn(); }
     recording = one.recording.on;
-    if (one.frame % 10 && ages.length > 10) return; // text ten times as slow as pictures can be read
+    const now = performance.now();
+    if (now - drawnAt > CURVES) {
+      drawnAt = now;
+      draws.forEach((draw) => draw());
+    }
+    if (now - toldAt < WORDS) return;
+    toldAt = now;
     main.dataset.ages = JSON.stringify([percentile(ages, 0.5), percentile(ages, 0.99), Math.max(...ages)].map(Math.round));
-    draws.forEach((draw) => draw());
     feel(one);
     force.show(one.fields, one.layer);
     hidden.hidden = one.layer === state.layer;

@@ -147,7 +147,7 @@ corpus: $(STAMP) ## simulated touches on disk, of which the encoders are asked f
 weights: $(STAMP) ## train an encoder on endless touches for a time, and go on later: [MINUTES=12 REAL="a.csv b.csv" WEIGHTS=runs/anytouch-tiny]
 	$(PY) -m experiments.encoders.train --minutes $(MINUTES) --real $(REAL) --out $(WEIGHTS)
 
-figures: $(STAMP) ## after new weights: measure the shipped encoder, then the results, pictures, notebooks and pages that show it: [TOUCH=manifest of real touch]
+figures: $(STAMP) ## after new weights: measure the shipped encoder, then the results, images, notebooks and pages that show it: [TOUCH=manifest of real touch]
 	$(PY) -m experiments.real.run anytouch-tiny untrained:anytouch-tiny$(if $(TOUCH), --data $(TOUCH))
 	$(PY) -m experiments.real.run anytouch-tiny --untouched median$(if $(TOUCH), --data $(TOUCH))
 	$(PY) -m experiments.encoders.picture docs/pictures/first_touch.png

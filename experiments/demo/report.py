@@ -63,7 +63,7 @@ def score_of(named: np.ndarray, test: Touches) -> Score:
 def gain_of(new: np.ndarray, old: np.ndarray, test: Touches) -> str:
     """Return by how many points `new` names more than `old`, with the paired interval."""
     sums = [[classification_sums(named == test.shape, test.object)] for named in (new, old)]
-    gain = paired_gain(*sums, measured=False)
+    gain = paired_gain(*sums, regression=False)
     value, low, high = (100 * float(gain[name] or 0.0) for name in ("difference", "low", "high"))
     return f"{value:+.0f} points [{low:+.0f}, {high:+.0f}]"
 

@@ -50,7 +50,7 @@ def configure(steps: int, masked: float, *, residual: bool) -> Config:
             "data.background": "subtract",
             "data.jitter": (0.0, 0.0, 0.0, 0.0),
             "data.batch_size": BATCH,
-            "data.clip_share": 1.0,
+            "data.clip_fraction": 1.0,
             "optim.learning_rate": 5e-4,
             "optim.grad_clip": 5.0,
             "run.steps": steps,

@@ -32,8 +32,8 @@ from anytouch_jax.weights import checkpoint
 NAMES = (RANDOM, "stage 1", "stage 2")
 
 
-def pictures_of(report: Path) -> list[Path]:
-    """The figures that a report shows; every one must be a readable picture beside it."""
+def images_of(report: Path) -> list[Path]:
+    """The figures that a report shows; every one must be a readable image beside it."""
     found = [
         report.parent / one for one in re.findall(r"!\[[^]]*\]\(([^)]+)\)", report.read_text())
     ]
@@ -118,7 +118,7 @@ def test_a_report_has_its_parts_in_order(tmp_path: Path) -> None:
         "| a | b\\|c |\n| --- | --- |\n| 1 | two lines |\n\nAfter.\n\n## "
         "Second\n\n![Second](figures/mine.png)\n"
     )
-    assert [one.name for one in pictures_of(path)] == ["shot.png", "mine.png"]
+    assert [one.name for one in images_of(path)] == ["shot.png", "mine.png"]
     plain = json.loads((out / "report.json").read_text())
     assert (plain["x"], plain["bad"], plain["list"], plain["path"]) == (0.5, None, [0, 1], "a")
     assert plain["part"]["title"] == "Second"
@@ -197,7 +197,7 @@ def test_a_report_holds_what_there_is_to_say(demo: tuple[Path, list[str]]) -> No
         "Probes",
         "Data and runs",
     ]
-    names = [one.name for one in pictures_of(path)]
+    names = [one.name for one in images_of(path)]
     assert names == ["reconstructions.png", "retrieval.png", "probes.png", "losses.png"]
     opening = text.split("\n\n")[1:4]
     beginnings = ("Learned: ", "Not shown to be learned: ", "More steps: ")

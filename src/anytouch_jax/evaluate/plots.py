@@ -32,7 +32,7 @@ _DPI = 110
 
 # The geometry of feature spaces was defined here.
 __all__ = [
-    "ShareBar",
+    "FractionBar",
     "Space",
     "alignment",
     "bars",
@@ -48,7 +48,7 @@ __all__ = [
 ]
 
 
-class ShareBar(NamedTuple):
+class FractionBar(NamedTuple):
     """A fraction (0..1) with its interval and the chance level; None is not drawn."""
 
     value: float
@@ -135,7 +135,9 @@ def smoothed(values: Array) -> Array:
     return np.convolve(values, kernel, "same") / np.convolve(np.ones(len(values)), kernel, "same")
 
 
-def bars(path: Path, series: Mapping[str, Mapping[str, ShareBar]], *, label: str = "share") -> None:
+def bars(
+    path: Path, series: Mapping[str, Mapping[str, FractionBar]], *, label: str = "fraction"
+) -> None:
     """Draw horizontal bars of fractions with their intervals; dashes mark chance.
 
     `series` is {panel: {name: ShareBar}}.

@@ -1,4 +1,4 @@
-"""The report of the demo: what it gained in words, then a picture for each thing that it says."""
+"""The report of the demo: what it gained in words, then a figure for each thing that it says."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PACKAGE, NOTHING = "anytouch-tiny", "the same network from nothing"
 HEAD, PIXELS, COMMONEST = "its head alone, in seconds", "a head on pixels", "the commonest shape"
 COLOURS = {PACKAGE: "#00656f", HEAD: "#6fb3ba", NOTHING: "#b4552d", PIXELS: "#8d969e"}
 GREY = "#8d969e"
-SHOWN = 8  # presses of a picture
+SHOWN = 8  # presses of a figure
 
 
 class Findings(NamedTuple):
@@ -36,8 +36,8 @@ class Findings(NamedTuple):
     nothing: Course
     pixels: np.ndarray  # (n,) numbers of NAMES that a head on raw pixels gives
     commonest: int  # the shape with most touches of train
-    depth: np.ndarray  # (n, h, w) mm, as the encoder of the package measures it
-    force: np.ndarray  # (n,) N
+    depth: np.ndarray  # (m, h, w) mm, as the encoder of the package measures the first touches
+    force: np.ndarray  # (m,) N
     usual_force: float  # N, the median of train
     trained_on: int  # touches
 
@@ -62,8 +62,8 @@ def score_of(named: np.ndarray, test: Touches) -> Score:
 
 def gain_of(new: np.ndarray, old: np.ndarray, test: Touches) -> str:
     """Return by how many points `new` names more than `old`, with the paired interval."""
-    sums = [[classification_sums(named == test.shape, test.object)] for named in (new, old)]
-    gain = paired_gain(*sums, regression=False)
+    first, second = ([classification_sums(one == test.shape, test.object)] for one in (new, old))
+    gain = paired_gain(first, second, regression=False)
     value, low, high = (100 * float(gain[name] or 0.0) for name in ("difference", "low", "high"))
     return f"{value:+.0f} points [{low:+.0f}, {high:+.0f}]"
 
@@ -71,13 +71,13 @@ def gain_of(new: np.ndarray, old: np.ndarray, test: Touches) -> str:
 def first_report(out: Path) -> Path:
     """Write what the encoder in the package says before any training, and return the page."""
     with tempfile.TemporaryDirectory() as folder:
-        picture = Path(folder) / "first.png"
-        _draw_examples(picture)
+        path = Path(folder) / "first.png"
+        _draw_examples(path)
         section = Section(
             "Before any training: the depth of two presses",
             "The encoder in the package reads depth and force from the image of a press. Above "
             "the presses, below their depth in mm.",
-            figure=picture,
+            figure=path,
         )
         lead = ["The demo is running. This page is written again when it has something to tell."]
         return write_report(out, [section], title="What the demo learns", lead=lead)
@@ -254,7 +254,7 @@ def _presses_section(found: Findings, folder: Path) -> Section:
 
 def _force_sections(found: Findings, folder: Path) -> list[Section]:
     """Return the section on force, or nothing if a constant guess is as good."""
-    test = found.test
+    test = _rows(found.test, np.arange(len(found.force)))
     off = np.abs(found.force - test.force)
     guess = np.abs(found.usual_force - test.force)
     low, high = mean_interval(guess - off, test.object)
@@ -262,7 +262,7 @@ def _force_sections(found: Findings, folder: Path) -> list[Section]:
         return []
     path = folder / "force.png"
     figure, axes = panels(1, 2, 4.2, 3.6)
-    axis, picture = axes[0]
+    axis, beside = axes[0]
     most = float(np.percentile(test.force, 99))
     axis.plot([0, most], [0, most], color=GREY, lw=1)
     axis.axhline(found.usual_force, color=GREY, ls="--", lw=1)
@@ -279,9 +279,9 @@ def _force_sections(found: Findings, folder: Path) -> list[Section]:
     axis.set(xlim=(0, most), ylim=(0, most), xlabel="true force, N", ylabel="measured, N")
     _bare(axis)
     row = int(np.argsort(-test.depth)[len(test.depth) // 20])
-    shown = picture.imshow(found.depth[row], cmap="viridis", vmin=0)
-    picture.set(xticks=[], yticks=[], title=f"depth of a {NAMES[test.shape[row]]}, mm")
-    figure.colorbar(shown, ax=picture, shrink=0.8)
+    shown = beside.imshow(found.depth[row], cmap="viridis", vmin=0)
+    beside.set(xticks=[], yticks=[], title=f"depth of a {NAMES[test.shape[row]]}, mm")
+    figure.colorbar(shown, ax=beside, shrink=0.8)
     write_figure(path, figure)
     text = (
         f"Force is off by {off.mean():.2f} N in the mean, and {guess.mean():.2f} N by always "
@@ -302,7 +302,7 @@ def _draw_examples(path: Path) -> None:
         shown = fields.at(*touch.frame.shape[:2])
         axes[0][column].imshow(touch.frame)
         axes[0][column].set_title(f"{touch.press}, {touch.sensor}", fontsize=8)
-        axes[1][column].imshow(shown.depth[0], cmap="viridis", vmin=0, vmax=0.6)
+        axes[1][column].imshow(shown.depth[0], cmap="viridis", vmin=0, vmax=1.0)
         told = f"{shown.depth[0].max():.2f} mm, {fields.force[0, 2]:.1f} N"
         axes[1][column].set_xlabel(told, fontsize=8)
         for axis in (axes[0][column], axes[1][column]):

@@ -34,6 +34,7 @@ from experiments.demo.training import (
 
 TRAIN = 1536  # touches
 TEST = 512
+MEASURED = 128  # touches of test whose force is measured, one by one
 SMALL = 4  # pixels that are averaged along each side for the head on pixels
 COMPONENTS = 192  # of the pixels: as many as features of the encoder
 
@@ -54,12 +55,14 @@ def pixel_names(learner: Learner, train: Touches, test: Touches) -> np.ndarray:
 
 
 def measured(encoder: Encoder, sensor: Path, test: Touches) -> tuple[np.ndarray, np.ndarray]:
-    """Return depth (n, h, w) in mm and force (n,) in N of the test touches."""
+    """Return depth (m, h, w) in mm and force (m,) in N of the first MEASURED test touches."""
     depth = []
     force = []
-    for frame, background in tracked(list(zip(test.frame, test.background, strict=True)), "depth"):
+    pairs = list(zip(test.frame, test.background, strict=True))[:MEASURED]
+    for frame, background in tracked(pairs, "depth"):
         fields = encoder.measure(frame, background, str(sensor))
         depth.append(fields.depth[0])
+        assert fields.force is not None  # the sensor knows its width
         force.append(fields.force[0, 2])
     return np.stack(depth), np.array(force)
 
@@ -78,7 +81,7 @@ def main() -> None:
 
     enable_compilation_cache()
     page = first_report(options.out).with_suffix(".html")
-    say(f"{page}: the first picture")
+    say(f"{page}: the first figures")
     sensor = write_ring_light(options.out / "ring_light.sensor")
     train, test = (
         simulate(sensor, split, count, say)

@@ -50,7 +50,7 @@ def write_ring_light(folder: Path) -> Path:
     # The powers of the normal are 1, 1, then 2, 2, 2: those of x^2 and y^2 make a glow.
     normal[[2, 4], 0] = GLOW * np.asarray(AMBER)
     lights = photometry._replace(normal=normal, halo=np.zeros_like(np.asarray(photometry.halo)))
-    gel = bases(body)[:1].mean(-1, keepdims=True) * np.asarray(AMBER) * 0.6
+    background = bases(body)[:1].mean(-1, keepdims=True) * np.asarray(AMBER) * 0.6
     numbers = OwnSensor(
         name="ring_light",
         width_mm=body.field[1],
@@ -61,7 +61,7 @@ def write_ring_light(folder: Path) -> Path:
         halo_mm=body.halo,
         spread=0.05,
     )
-    return write_sensor(folder, numbers, np.rint(255 * gel).clip(1, 255), lights)
+    return write_sensor(folder, numbers, np.rint(255 * background).clip(1, 255), lights)
 
 
 def simulate(sensor: Path, split: Any, count: int, log: Callable[[str], None]) -> Touches:

@@ -83,7 +83,7 @@ def features_of(encoder: Encoder, touches: Any) -> np.ndarray:
     return np.asarray(encoder.encode_touch(frames, sensor=SENSOR))
 
 
-def film_of(encoder: Encoder, seed: int = 3) -> list[Shown]:
+def video_of(encoder: Encoder, seed: int = 3) -> list[Shown]:
     """Return the frames: each object is taught, then pressed once."""
     rng = np.random.default_rng(seed)
     taught = {
@@ -99,6 +99,7 @@ def film_of(encoder: Encoder, seed: int = 3) -> list[Shown]:
         touches = pressed(name, rng, DEEPEST * rise, still=True)
         named = np.argmax((features_of(encoder, touches) - middle) @ means.T, 1)
         measured = encoder.measure(touches.image, touches.background[0], SENSOR)
+        assert measured.force is not None
         shown = measured.at(*touches.image.shape[1:3])
         for number in range(FRAMES):
             deepest = float(shown.depth[number].max())
@@ -126,17 +127,17 @@ class Canvas:
         shape = frames[0].image.shape
         tall = 0.72
         wide = tall * HEIGHT / WIDTH * shape[1] / shape[0]
-        picture = self.figure.add_axes((0.025, 0.13, wide, tall))
+        image = self.figure.add_axes((0.025, 0.13, wide, tall))
         depth = self.figure.add_axes((0.045 + wide, 0.13, wide, tall))
-        for axis, title in ((picture, "a press"), (depth, "depth")):
+        for axis, title in ((image, "a press"), (depth, "depth")):
             axis.set_axis_off()
             axis.set_title(title, color=SOFT, fontsize=11, loc="left", pad=7)
-        self.picture = picture.imshow(frames[0].image)
+        self.image = image.imshow(frames[0].image)
         self.depth = depth.imshow(frames[0].depth, cmap="viridis", vmin=0, vmax=DEEPEST)
         bar = self.figure.add_axes((0.055 + 2 * wide, 0.13, 0.012, tall))
         scale = self.figure.colorbar(self.depth, cax=bar, ticks=[0, DEEPEST])
         scale.ax.set_yticklabels(["0", f"{DEEPEST} mm"], color=SOFT, fontsize=10)
-        scale.outline.set_edgecolor(LINE)  # type: ignore[operator]
+        scale.outline.set_edgecolor(LINE)
         bar.tick_params(length=0)
         left = 0.14 + 2 * wide
         self.name = self.figure.text(left, 0.74, "", color=TEXT, fontsize=24, weight="bold")
@@ -158,7 +159,7 @@ class Canvas:
         one = self.frames[number]
         begin = number - number % FRAMES
         past = self.frames[begin : number + 1]
-        self.picture.set_data(one.image)
+        self.image.set_data(one.image)
         self.depth.set_data(one.depth)
         self.name.set_text(one.name or "–")
         self.name.set_color(TEXT if one.name else SOFT)
@@ -179,7 +180,7 @@ def write(out: Path, frames: list[Shown], quality: int = 93) -> int:
     animation.frames = [
         np.ascontiguousarray(canvas.draw(number)[..., ::-1]) for number in range(len(frames))
     ]
-    animation.durations = np.full(len(frames), MILLISECONDS, np.int32)
+    animation.durations = np.full(len(frames), MILLISECONDS, np.int32)  # type: ignore[assignment]
     out.parent.mkdir(parents=True, exist_ok=True)
     if not cv2.imwriteanimation(str(out), animation, [cv2.IMWRITE_WEBP_QUALITY, quality]):
         raise OSError(f"{out} was not written")
@@ -192,7 +193,7 @@ def main() -> None:
     parser.add_argument("model", nargs="?", default="anytouch-tiny", help="an encoder")
     options = parser.parse_args()
     enable_compilation_cache()
-    frames = film_of(at.load_encoder(options.model))
+    frames = video_of(at.load_encoder(options.model))
     size = write(options.out, frames)
     pairs = list(zip(frames, np.repeat(list(OBJECTS), FRAMES), strict=True))
     right = np.mean([one.name == name for one, name in pairs if one.name])

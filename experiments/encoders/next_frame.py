@@ -108,7 +108,7 @@ def scores(own: np.ndarray, copied: np.ndarray, objects: np.ndarray) -> dict[str
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--steps", type=int, default=200)
-    parser.add_argument("--masked", type=float, default=0.75, help="share of the patches")
+    parser.add_argument("--masked", type=float, default=0.75, help="fraction of the patches")
     parser.add_argument(
         "--whole", action="store_true", help="predict the whole frame, as the paper"
     )

@@ -83,7 +83,7 @@ def ablations(folder: Path) -> Page:
     """Table 6, and the models of Tables 2 and 3."""
     of = Matrix(folder / "matrix.jsonl", "ablations")
     whole = paper.TABLE6["anytouch"]
-    rows = [
+    rows: list[Row] = [
         (
             title(name),
             of.value(name, FOUR),
@@ -111,7 +111,7 @@ def ablations(folder: Path) -> Page:
         "static_only",
         "anytouch",
     )
-    others = [
+    others: list[Row] = [
         (
             title(name),
             *(
@@ -123,7 +123,9 @@ def ablations(folder: Path) -> Page:
         for name in names
     ]
     frames, words = next_frames(folder / "next_frame.jsonl")
-    tables = [rows, others, frames] if frames else [rows, others]
+    tables: list[list[Row]] = [rows, others]
+    if frames:
+        tables.append(frames)
     return Page("ablations", tables, findings, words={"next_frame": words})
 
 
@@ -135,7 +137,7 @@ def next_frames(file: Path) -> tuple[list[Row], str]:
         for part, clips in (("all", "in contact"), ("moving", "the moving half")):
             one = record[part]
             low, high = one["interval"]
-            gain = Value(one["gain"], (low, high))
+            gain = Value(one["gain"], low, high)
             rows.append((name, clips, record["steps"], one["error"], one["copy"], gain))
             better.append(low > 0)
     if not rows:

@@ -14,7 +14,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, TypeAlias
 
 import jax
@@ -104,7 +104,7 @@ class TouchSensor:
                 raise UserError(f'{name} is "{words[0]}" or "{words[1]}", not {word!r}')
         refuse_forked()
         self._unit = nominal_unit(kind) if unit is None else unit
-        self._view = GelView(
+        self.view = GelView(
             kind, size, fidelity, load, float(self._unit.thickness), float(self._unit.modulus)
         )
         self._model = model
@@ -112,27 +112,34 @@ class TouchSensor:
         self._sites = (site,) if isinstance(site, str) else tuple(site)
         if not self._sites:
             raise UserError("name at least one site")
-        self._scenes = [Pads(model, self._sites, self._view, self._unit)]
+        self._scenes = [Pads(model, self._sites, self.view, self._unit)]
         if compliant:
             for pad in self._scenes[0].pads:
-                soften(model, pad, self._view.gel)
-        self._device = jax.jit(device_of, static_argnums=0)(self._view, self._unit)
+                soften(model, pad, self.view.gel)
+        self.device = _device(self.view)(self._unit)
         self._states: list[GelState | None] = [None] * len(self._sites)
         self._count = 0
         self._plain: np.ndarray | None = None
         # The noise of the background is that of one picture that was taken before.
         before = np.full(2, 2**32 - 1, np.uint32)
-        self.background = np.asarray(_untouched(self._view)(self._device, before))
+        self.background = np.asarray(_untouched(self.view)(self.device, before))
 
     @property
     def sensor(self) -> Sensor:
         """The sensor."""
-        return self._view.sensor
+        return self.view.sensor
 
     @property
     def sites(self) -> tuple[str, ...]:
         """The sites of its pads."""
         return self._sites
+
+    def meet(self, data: State) -> list[Met | None]:
+        """Return what each pad meets, without solving it; the pads remember where it was.
+
+        For `gel.feel` in a program of your own.
+        """
+        return self._meet([data] if isinstance(data, mujoco.MjData) else list(data))
 
     def reset(self) -> None:
         """Forget what has touched the pads, and start the noise again."""
@@ -184,7 +191,7 @@ class TouchSensor:
     def _meet(self, scenes: list[mujoco.MjData]) -> list[Met | None]:
         """Return what each pad of each scene meets."""
         while len(self._scenes) < len(scenes):
-            self._scenes.append(Pads(self._model, self._sites, self._view, self._unit))
+            self._scenes.append(Pads(self._model, self._sites, self.view, self._unit))
         if len(self._states) != len(scenes) * len(self._sites):
             self._states = [None] * (len(scenes) * len(self._sites))
         if len(scenes) == 1:
@@ -203,15 +210,15 @@ class TouchSensor:
             one = met[row]
             assert one is not None
             state = None if one.is_new else self._states[row]
-            states.append(unloaded(self._view) if state is None else state)
+            states.append(unloaded(self.view) if state is None else state)
             contacts.append(one.contact)
         count = 1 << (len(touched) - 1).bit_length()
         more = count - len(touched)
         stacked_states: GelState = _stack(states + states[-1:] * more)
         stacked: GelContact = _stack(contacts + contacts[-1:] * more)
         chosen = keys[touched + touched[-1:] * more]
-        after, readings = _felt_program(self._view)(
-            self._device, stacked_states, stacked, chosen, self.background
+        after, readings = _felt_program(self.view)(
+            self.device, stacked_states, stacked, chosen, self.background
         )
         after, readings = jax.tree.map(np.asarray, (after, readings))
         result = {}
@@ -222,11 +229,11 @@ class TouchSensor:
 
     def _nothing(self, key: np.ndarray) -> TouchReading:
         """Return the reading of a pad that nothing touches."""
-        height, width = self._view.image
+        height, width = self.view.image
         flat = np.zeros((height, width), np.float32)
         image = self.background
         if self._unit.noise > 0:
-            image = np.asarray(_untouched(self._view)(self._device, key))
+            image = np.asarray(_untouched(self.view)(self.device, key))
         zero = np.zeros((), np.float32)
         return TouchReading(
             image=image,
@@ -240,6 +247,12 @@ class TouchSensor:
             indentation=zero,
             touched=np.zeros((), bool),
         )
+
+
+@lru_cache(maxsize=32)
+def _device(view: GelView) -> Callable[[Unit], GelDevice]:
+    """Return the compiled `device_of`."""
+    return jax.jit(partial(device_of, view))
 
 
 @lru_cache(maxsize=32)

@@ -52,7 +52,7 @@ def gripper_scene(sensor: str, held: str, *, half: float, gravity: float = 9.81)
   </asset>
   <worldbody>
     <light pos=".1 -.3 .5" dir="-.2 .6 -1"/>
-    <camera name="view" pos=".03 -.24 {HEIGHT * MM + 0.05}" xyaxes="1 .1 0 -.02 .2 1" fovy="42"/>
+    <camera name="view" pos=".04 -.2 .11" xyaxes="1 .2 0 -.06 .28 1" fovy="42"/>
     <geom name="table" type="plane" size=".5 .5 .01" material="table" contype="2" conaffinity="2"/>
     <body name="hand" pos="0 0 {HEIGHT * MM}">
       <joint name="lift" type="slide" axis="0 0 1" damping="20"/>

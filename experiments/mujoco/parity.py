@@ -48,16 +48,19 @@ class Options:
     out: Path = RESULTS
 
 
-def presses(sensor: str, shape: Shape, count: int, rng: np.random.Generator) -> dict[str, list]:
-    """Return errors of `count` presses of a shape, each with a weight at a drawn place."""
+def presses(
+    sensor: str, shape: Shape, count: int, rng: np.random.Generator, simulate: Any
+) -> dict[str, list]:
+    """Return errors of `count` presses of a shape, each with a weight at a drawn place.
+
+    `simulate` is `simulate_touch` of a height map and poses.
+    """
     model, data = loaded(pressing_scene(shape, sensor))
     touch = TouchSensor(model, "pad", sensor, size=SIZE)
     # The object must rest where it was put: only z is free.
     model.dof_damping[[0, 1, 3]] = 1e3
-    unit = nominal_unit(sensor)
     relief = height_map(shape)
     key = jax.random.split(jax.random.key(0), 2)[1]
-    simulate = jax.jit(lambda pose: at.simulate_touch(relief, pose, sensor, size=SIZE, unit=unit))
     found: dict[str, list] = {"grey": [], "force": [], "rigid": []}
     for _ in range(count):
         mujoco.mj_resetData(model, data)
@@ -66,7 +69,7 @@ def presses(sensor: str, shape: Shape, count: int, rng: np.random.Generator) -> 
         data.qpos[3] = rng.uniform(-np.pi, np.pi)
         newton = rng.uniform(0.2, 2.0)
         data.qfrc_applied[2] = -newton
-        mujoco.mj_step(model, data, 500)
+        mujoco.mj_step(model, data, 400)
         mujoco.mj_forward(model, data)
         reading = touch.read(data, key)
         x, y = data.qpos[:2] / MM
@@ -74,7 +77,7 @@ def presses(sensor: str, shape: Shape, count: int, rng: np.random.Generator) -> 
         c, s = np.cos(turn), np.sin(turn)
         # The place of the object's map that lies under the middle of the pad.
         pose = [-(c * x + s * y), s * x - c * y, turn, float(reading.indentation)]
-        other = simulate(np.asarray([pose], np.float32))
+        other = simulate(relief, np.asarray([pose], np.float32))
         pressure = np.asarray(other.pressure[0])
         inside = pressure > 0.02 * pressure.max()
         apart = np.abs(reading.image.astype(float) - np.asarray(other.image[0])).mean(-1)
@@ -89,8 +92,12 @@ def parity(options: Options, sensor: str) -> None:
     rng = np.random.default_rng(0)
     count = options.poses // len(SHAPES)
     shapes = {}
+    unit = nominal_unit(sensor)
+    simulate = jax.jit(
+        lambda relief, pose: at.simulate_touch(relief, pose, sensor, size=SIZE, unit=unit)
+    )
     for name, shape in SHAPES.items():
-        found = presses(sensor, shape, count, rng)
+        found = presses(sensor, shape, count, rng, simulate)
         shapes[name] = {
             "poses": count,
             "grey": float(np.mean(found["grey"])),

@@ -40,8 +40,8 @@ class Options:
 
     tasks: tyro.conf.Positional[tuple[Literal["hold", "align"], ...]] = ("hold", "align")
     seeds: int = 3
-    demonstrations: int = 192  # episodes
-    episodes: int = 72  # of the test
+    readings: int = 1920  # of all demonstrations of a seed
+    episodes: int = 48  # of the test
     model: str = "anytouch-tiny"
     out: Path = RESULTS
 
@@ -80,7 +80,7 @@ def demonstrate(
     for first in range(0, count, AT_ONCE):
         episodes = task.begin(rng, min(AT_ONCE, count - first))
         eye.start(episodes)
-        for step in range(task.steps):
+        for step in range(task.shown):
             right = task.oracle(episodes, step)
             states.append(task.state(episodes, step))
             features.append(eye.features(episodes))
@@ -150,7 +150,7 @@ def study(task: Task, encoder: Any, options: Options, seed: int) -> None:
     """Fit and test all policies of a task with one seed, and write their records."""
     eye = Eye(task, encoder)
     states, features, actions = demonstrate(
-        task, eye, np.random.default_rng([seed, 1]), options.demonstrations
+        task, eye, np.random.default_rng([seed, 1]), options.readings // task.shown
     )
     mix = np.random.default_rng([seed, 3])
     shuffled = features[mix.permutation(len(features))]
@@ -175,7 +175,7 @@ def study(task: Task, encoder: Any, options: Options, seed: int) -> None:
             "cost": cost.round(4).tolist(),
             "success": good.astype(int).tolist(),
             "model": options.model,
-            "demonstrations": options.demonstrations,
+            "demonstrations": options.readings // task.shown,
         }
         write_record(options.out, key, record)
         print(f"{key}: cost {cost.mean():.2f}, success {good.mean():.0%}", flush=True)

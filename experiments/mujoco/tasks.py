@@ -37,6 +37,7 @@ class Task(NamedTuple):
 
     name: str
     steps: int
+    shown: int  # steps of a demonstration
     begin: Callable[[np.random.Generator, int], Episodes]
     state: Callable[[Episodes, int], Array]  # (n, p) what a robot knows without touch
     oracle: Callable[[Episodes, int], Array]  # (n,) the right action
@@ -51,9 +52,10 @@ CAN = (
     '<geom name="held" type="cylinder" size=".011 .02" mass=".08" friction=".6" contype="3" '
     'conaffinity="3" rgba=".85 .35 .2 1"/>'
 )
-HOLD_STEPS = 38  # of 50 ms
-LIFTED = 10  # the step at which the gripper goes up
-RISES = 14  # steps that it takes
+HOLD_STEPS = 20  # of 100 ms
+LIFTED = 5  # the step at which the gripper goes up
+RISES = 7  # steps that it takes
+CHANGE = 0.5  # of the logarithm of the grip in a step, at most
 UP = 0.04  # m
 LEAST, MOST = 0.1, 6.0  # N of grip
 SAFE = 1.3  # the oracle's grip over what the can needs
@@ -108,17 +110,17 @@ def _height(step: float) -> float:
 
 def hold_oracle(episodes: Episodes, step: int) -> Array:
     """Return the change of the logarithm of the grip towards what the can needs."""
-    change: Array = np.clip(np.log(SAFE * needed(episodes) / _grip(episodes)), -0.3, 0.3)
+    change: Array = np.clip(np.log(SAFE * needed(episodes) / _grip(episodes)), -CHANGE, CHANGE)
     return change
 
 
 def hold_act(episodes: Episodes, step: int, action: Array) -> None:
-    """Change the grips, and move on by 50 ms."""
-    grip = np.clip(_grip(episodes) * np.exp(np.clip(action, -0.3, 0.3)), LEAST, MOST)
+    """Change the grips, and move on by 100 ms."""
+    grip = np.clip(_grip(episodes) * np.exp(np.clip(action, -CHANGE, CHANGE)), LEAST, MOST)
     for model, data, one in zip(episodes.models, episodes.datas, grip, strict=True):
         data.ctrl[2:] = one
-        for part in range(5):
-            data.ctrl[0] = _height(step + part / 5)
+        for part in range(10):
+            data.ctrl[0] = _height(step + part / 10)
             mujoco.mj_step(model, data, 5)
 
 
@@ -140,7 +142,7 @@ KEY = (
     '<geom name="held" type="box" size=".004 .016 .003" mass=".008" friction="1" contype="3" '
     'conaffinity="3" rgba=".8 .7 .2 1"/>'
 )
-ALIGN_STEPS = 12
+ALIGN_STEPS = 10
 WIDEST = np.deg2rad(25)
 SPEED = np.deg2rad(6)  # at most in a step
 LEVEL = 2.0  # degrees that are level
@@ -213,11 +215,20 @@ def align_success(episodes: Episodes) -> Array:
 
 TASKS = {
     "hold": Task(
-        "hold", HOLD_STEPS, begin_hold, hold_state, hold_oracle, hold_act, hold_cost, hold_success
+        "hold",
+        HOLD_STEPS,
+        HOLD_STEPS,
+        begin_hold,
+        hold_state,
+        hold_oracle,
+        hold_act,
+        hold_cost,
+        hold_success,
     ),
     "align": Task(
         "align",
         ALIGN_STEPS,
+        3,  # the imprint does not change as the wrist turns: other keys show more
         begin_align,
         align_state,
         align_oracle,

@@ -13,7 +13,7 @@ mujoco = pytest.importorskip("mujoco")
 
 import anytouch_jax as at  # noqa: E402
 from anytouch_jax.sim.mujoco import TouchSensor, nominal_unit  # noqa: E402
-from anytouch_jax.sim.mujoco.pad import gel_stiffness  # noqa: E402
+from anytouch_jax.sim.mujoco.pad import Rays, gel_stiffness  # noqa: E402
 from anytouch_jax.sim.sensing.sensors import SENSORS  # noqa: E402
 from experiments.mujoco.scenes import MM, SHAPES, height_map, loaded, pressing_scene  # noqa: E402
 
@@ -259,6 +259,37 @@ def test_a_finger_behind_which_something_lies_feels_what_is_in_front():
         if before is not None:
             np.testing.assert_allclose(reading.depth, before.depth, atol=1e-4)
         before = reading
+
+
+def test_rays_meet_what_a_ray_meets():
+    """Many geoms to a body, some of which collide by a pair alone or not at all."""
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        geoms = ""
+        for kind in rng.choice(["box", "sphere", "capsule", "cylinder", "ellipsoid"], 4):
+            size, place, turn = rng.uniform(0.003, 0.01, 3), *rng.uniform(-0.03, 0.03, (2, 3))
+            words = [" ".join(map(str, one)) for one in (size, place, 6000 * turn)]
+            mask = rng.integers(2)
+            geoms += (
+                f'<geom type="{kind}" size="{words[0]}" pos="{words[1]}" euler="{words[2]}" '
+                f'contype="{mask}" conaffinity="{mask}" mass=".1" rgba="1 1 1 {mask}"/>'
+            )
+        model, data = loaded(
+            f'<mujoco><worldbody><site name="pad" euler="{rng.integers(360)} 70 20"/>'
+            f"<body><freejoint/>{geoms}</body></worldbody></mujoco>"
+        )
+        mujoco.mj_forward(model, data)
+        points = tuple(rng.uniform(-0.03, 0.03, (2, 40)))
+        along, _ = Rays(model).along(data, 0, [0, 1, 2, 3], points)
+        model.geom_rgba[:, 3] = 1
+        frame = data.site_xmat[0].reshape(3, 3)
+        for x, y, z in zip(*points, along, strict=True):
+            start = frame @ [x, y, -1]
+            far = mujoco.mj_ray(model, data, start, frame[:, 2], None, 1, -1, np.zeros(1, np.int32))
+            # Beside a rim the rays, which are not quite parallel, may pass.
+            if np.isfinite(z) and far >= 0:
+                assert abs(z - 1e3 * (far - 1)) < 0.1
+            assert np.isfinite(z) == (far >= 0)
 
 
 def test_the_core_imports_none_of_it_and_the_extra_is_named():

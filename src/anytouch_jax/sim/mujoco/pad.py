@@ -54,6 +54,16 @@ class Grid(NamedTuple):
     y: Array
 
 
+def widen(model: mujoco.MjModel) -> None:
+    """Make the bounds of bodies so wide that rays meet all their geoms.
+
+    `mj_multiRay` passes by a body outside its bounds, and these leave out geoms that collide by a
+    pair alone, or not at all.
+    """
+    roots = model.body_bvhadr[model.body_bvhnum > 0]
+    model.bvh_aabb[roots, 3:] = np.maximum(model.bvh_aabb[roots, 3:], FAR)
+
+
 class Rays:
     """Reads height maps of a scene. Each thread needs its own."""
 
@@ -63,6 +73,7 @@ class Rays:
         # An invisible geom is passed by rays, but it is touched like any other.
         self._model.geom_rgba[:, 3] = 1
         self._model.geom_matid[:] = -1
+        widen(self._model)
 
     def along(
         self,

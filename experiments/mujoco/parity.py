@@ -27,7 +27,7 @@ import anytouch_jax as at
 from anytouch_jax.sim.endless import CAMERAS
 from anytouch_jax.sim.mujoco import TouchSensor, nominal_unit
 from anytouch_jax.sim.mujoco.gel import feel, unloaded
-from anytouch_jax.sim.mujoco.pad import Grid, Rays
+from anytouch_jax.sim.mujoco.pad import RayGrid, Rays
 from experiments.benchmarks import machine
 from experiments.command import run_script
 from experiments.mujoco.scenes import MM, SHAPES, Shape, height_map, loaded, pressing_scene
@@ -221,7 +221,7 @@ def rays() -> dict[str, float]:
         model, data = loaded(pressing_scene(shape, "digit"))
         mujoco.mj_forward(model, data)
         geom = model.geom("object").id
-        work = partial(Rays(model).along, data, 0, [geom], Grid(x, y))
+        work = partial(Rays(model).along, data, 0, [geom], RayGrid(x, y))
         found[name] = timed(work, 1.0)["processor"]
     one = np.zeros(1, np.int32)
 

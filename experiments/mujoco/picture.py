@@ -74,11 +74,11 @@ def frames() -> list[np.ndarray]:
     pads = ("left_pad", "right_pad")
     touch = TouchSensor(model, pads, SENSOR, size=112, unit=nominal_unit(SENSOR, dots=True))
     made = []
-    for step in range(100):
-        second = step / 25
+    for step in range(52):
+        second = step / 12.5
         grip = np.interp(second, [0, 0.2, 1.9, 2.2], [0.2, 0.72, 0.72, 2.2])
         part = np.clip((second - 0.6) / 2.6, 0, 1)
-        for _ in range(4):
+        for _ in range(8):
             data.ctrl[0] = 0.045 * part**2 * (3 - 2 * part)
             data.ctrl[2:] = grip
             mujoco.mj_step(model, data, 5)
@@ -106,7 +106,7 @@ def main() -> None:
         folder / "mujoco.webp",
         save_all=True,
         append_images=images[1:],
-        duration=40,
+        duration=80,
         loop=0,
         quality=60,
         method=6,

@@ -47,7 +47,7 @@ class Pad(NamedTuple):
     radius: float  # m from its middle to its corner
 
 
-class Grid(NamedTuple):
+class RayGrid(NamedTuple):
     """Points of a height map in the pad's frame."""
 
     x: Array  # (h, w) m
@@ -118,7 +118,7 @@ class Rays:
         return along.astype(np.float32).reshape(shape), met.reshape(shape)
 
 
-def find_pad(model: mujoco.MjModel, name: str, sensor: Sensor, grid: Grid) -> Pad:
+def find_pad(model: mujoco.MjModel, name: str, sensor: Sensor, grid: RayGrid) -> Pad:
     """Return the pad at a site.
 
     Raises UserError for a scene without that site, for a site that is no box or has another size

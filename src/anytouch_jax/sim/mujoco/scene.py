@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.sim.mujoco.gel import GelContact, GelView
-from anytouch_jax.sim.mujoco.pad import MM, Array, Grid, Pad, Rays, find_pad
+from anytouch_jax.sim.mujoco.pad import MM, Array, Pad, RayGrid, Rays, find_pad
 from anytouch_jax.sim.recorder import SPACING
 from anytouch_jax.sim.sensing.sensors import Unit
 
@@ -301,7 +301,7 @@ class Pads:
         return np.array([moved[0] * MM, moved[1] * MM, twist])
 
 
-def _grid(view: GelView, unit: Unit) -> Grid:
+def _grid(view: GelView, unit: Unit) -> RayGrid:
     """Return the points of the height map in the pad's frame, as the unit is mounted."""
     (rows, columns), pitch = view.grid
     y, x = np.meshgrid(
@@ -311,7 +311,7 @@ def _grid(view: GelView, unit: Unit) -> Grid:
     y = y - float(unit.offset[1])
     c = float(np.cos(unit.rotation))
     s = float(np.sin(unit.rotation))
-    return Grid((c * x + s * y) / MM, (c * y - s * x) / MM)
+    return RayGrid((c * x + s * y) / MM, (c * y - s * x) / MM)
 
 
 def _or_nothing(heights: Map) -> Map:

@@ -66,6 +66,7 @@ CORE: dict[str, set[str]] = {
     "encoder": {"nn", "weights", "objectives", "ops", "data", "config", "train"},
     # objectives: the errors of stage 1 on pixels are measured by its own functions
     "evaluate": {"encoder", "objectives", "data", "nn.functional", "ops", "config"},
+    "finetuning": {"objectives", "weights", "data", "config", "train", "encoder", "evaluate"},
     "training": {
         "nn", "objectives", "ops", "weights", "data", "config", "train", "encoder", "evaluate",
     },

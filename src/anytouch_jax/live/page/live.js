@@ -117,7 +117,7 @@ function showLive(source, about) {
     feels.hidden = !known && one.contact === null;
     const named = known && one.contact !== false && one.label !== undefined;
     feels.classList.toggle("novel", Boolean(named && one.novel));
-    sure.hidden = !named || one.novel;
+    sure.hidden = !named || one.novel || one.p === undefined;
     nearest.hidden = !named;
     why.textContent = "";
     if (!known && one.contact === null) { felt.textContent = ""; return; }

@@ -24,7 +24,7 @@ from anytouch_jax.live.stream import Embedded, Source, StreamSettings, stream_wi
 
 if TYPE_CHECKING:
     from anytouch_jax.encoder.encoder import Encoder
-    from anytouch_jax.encoder.linear_head import LinearHead
+    from anytouch_jax.encoder.linear_head import Head
     from anytouch_jax.live.page.feature_map import FeatureMap
 
 _KEPT = 600  # frames whose times make p50 and p99, as on the page
@@ -55,7 +55,7 @@ class Live:
         encoder: Encoder,
         *,
         sensor: str | None,
-        head: LinearHead | None = None,
+        head: Head | None = None,
         space: FeatureMap | None = None,
         out: Path,
         camera: CameraSettings | None = None,
@@ -113,7 +113,7 @@ class Live:
         if self._thread is not None:
             self._thread.join(3)
 
-    def _head_in_use(self) -> LinearHead | None:
+    def _head_in_use(self) -> Head | None:
         return self.teacher.head or self._head
 
     async def packets(self, layer: str) -> AsyncIterator[bytes]:

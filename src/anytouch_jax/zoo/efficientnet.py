@@ -131,7 +131,7 @@ def run_network(
     x = jax.lax.conv_general_dilated(
         x, stem["kernel"], (2, 2), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC")
     )
-    x = _clipped(x + stem["bias"])
+    x = _clipped(x + _wide(stem["bias"]))
     means = []
     # Blocks behind the last one that is read are not computed.
     for number in range(max(read) + 1):
@@ -169,13 +169,18 @@ def _depthwise(params: Params, x: jax.Array, stride: int) -> jax.Array:
         pads.append((total // 2, total - total // 2))
     x = jnp.pad(x, ((0, 0), *pads, (0, 0)))
     # A sum of shifted pictures: XLA's grouped convolution takes several times as long on a CPU.
-    total_sum: Any = params["bias"]
+    total_sum: jax.Array = _wide(params["bias"])
     for down in range(size):
         for right in range(size):
             rows = slice(down, down + stride * (outs[0] - 1) + 1, stride)
             columns = slice(right, right + stride * (outs[1] - 1) + 1, stride)
-            total_sum = total_sum + x[:, rows, columns] * kernel[down, right]
+            total_sum = total_sum + x[:, rows, columns] * _wide(kernel[down, right])
     return total_sum
+
+
+def _wide(values: jax.Array) -> jax.Array:
+    """Return values of each channel (C,) with the axes of pictures."""
+    return jnp.asarray(values)[None, None, None]
 
 
 def _clipped(x: jax.Array) -> jax.Array:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from anytouch_jax.encoder.arrays import Array
 from anytouch_jax.errors import UserError
 from anytouch_jax.live.cameras import CameraSettings, LoopedFilm, open_source
 from anytouch_jax.live.examples import EXAMPLE, ExampleCamera
@@ -109,12 +110,20 @@ class Live:
     def stop(self) -> None:
         """End the stream, and the recording."""
         self._stopped = True
+        self.teacher.longer.stop()
         self.recorder.stop()
         if self._thread is not None:
             self._thread.join(3)
 
     def _head_in_use(self) -> Head | None:
         return self.teacher.head or self._head
+
+    def _named(self, frame: Embedded, prepared: Array) -> dict[str, Any]:
+        """Return the name of a frame, by the encoder that was trained longer if there is one."""
+        tuned = self.teacher.longer.tuned
+        if tuned is None:
+            return name_touch(self._head_in_use(), frame.values)
+        return name_touch(tuned.head, tuned.features(prepared, self._row))
 
     async def packets(self, layer: str) -> AsyncIterator[bytes]:
         """Yield each newest frame as a layer (see `packet`).
@@ -180,7 +189,7 @@ class Live:
             "taught": self.teacher.version,
         }
         about |= describe_touch(score, self.frames.threshold, fields)
-        about |= name_touch(self._head_in_use(), frame.values)
+        about |= self._named(frame, kept[-1].prepared)
         spaces = {"near": self._space, "recorded": self.teacher.space}
         about |= self._nearest(frame.values, spaces)
         self._newest = Shown(self._newest.number + 1, about, picture, setup.small, fields)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -43,7 +44,7 @@ def main() -> None:
     rng = np.random.default_rng(0)
     for count in given.batches:
         touches = rng.integers(0, 256, (count, 1, side, side, 3), np.uint8)
-        ways = [lambda e=e: e.encode_touch(touches, "digit") for e in (xla, engine)]
+        ways = [partial(one.encode_touch, touches, "digit") for one in (xla, engine)]
         for way in ways:
             way()  # compiles
         times = np.array([[seconds(way) for way in ways] for _ in range(given.rounds)])

@@ -39,7 +39,9 @@ def object_score(
     head = result.head
     assert isinstance(head, LinearHead)
     rows = np.flatnonzero(data.split == "test")
-    values = embed_rows(encoder, data.manifest, rows, pooling=head.pooling, gels=data.gels)[1]
+    values = embed_rows(
+        encoder, data.manifest, rows, pooling=head.pooling, backgrounds=data.backgrounds
+    )[1]
     chances = head(values)[1]
     names = np.unique(data.recording[rows])
     means = np.stack([chances[data.recording[rows] == name].mean(0) for name in names])

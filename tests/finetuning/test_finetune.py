@@ -39,7 +39,7 @@ def run(tmp_path_factory, data):
     config = replace(config, model=replace(config.model, embed=4))
     params = build(config.model).init(jax.random.key(0))
     folder = tmp_path_factory.mktemp("runs") / "stage1"
-    return save_run(folder, config, params, seen=["gelsight", "digit"])
+    return save_run(folder, config, params, seen=["backgroundsight", "digit"])
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +68,7 @@ def test_a_number_is_read_better_than_by_the_linear_head(tuned):
 
 
 def test_the_folder_is_an_encoder_with_its_head(tuned, data):
-    """What was promised comes out again: features, numbers and intervals, by the head's own file."""
+    """Features, numbers and intervals come out again as they were promised."""
     result, _, _ = tuned
     encoder = at.load_encoder(result.folder, engine="xla")
     head = at.load_head(result.folder)
@@ -107,7 +107,9 @@ def test_a_second_run_refuses_and_changes_nothing(tuned, data, run):
     with pytest.raises(UserError, match="fine-tuned before") as error:
         at.finetune(data, "force", out=result.folder, model=run)
     assert "\n" not in str(error.value)
-    assert {file.name: file.read_bytes() for file in result.folder.iterdir() if file.is_file()} == before
+    assert {
+        file.name: file.read_bytes() for file in result.folder.iterdir() if file.is_file()
+    } == before
 
 
 def test_ctrl_c_keeps_the_best(data, run, tmp_path):

@@ -32,7 +32,7 @@ def test_frames_of_a_clip_change_alike_and_touches_apart():
     out = np.asarray(changed(jax.random.key(1), several))
     np.testing.assert_array_equal(out[:, 0], out[:, 1])
     assert np.abs(out[0] - out[1]).max() > 1
-    assert 0 <= out.min() and out.max() <= 255
+    assert out.min() >= 0 and out.max() <= 255
 
 
 def test_a_gradient_keeps_its_direction():

@@ -34,7 +34,7 @@ def scaled_features(features: npt.ArrayLike, mean: Array, scale: Array) -> Array
 
 
 def check_features_of(
-    head: Fitted, source: str, fingerprint: str, pooling: str, frames: int, join: str
+    head: Fitted, source: str, fingerprint: str, pooling: str, frames: int, aggregation: str
 ) -> None:
     """Raise UserError unless a head was fitted on such features, see `LinearHead.check`."""
     wrong = []
@@ -42,8 +42,8 @@ def check_features_of(
         wrong.append(f"--pooling {head.pooling}")
     if frames != head.frames:
         wrong.append(f"--frames {head.frames}")
-    if join != "mean":  # heads are fitted on no other
-        wrong.append("--join mean")
+    if aggregation != "mean":  # heads are fitted on no other
+        wrong.append("--aggregation mean")
     if wrong:
         raise UserError(f"The head was fitted on other features. Give {' '.join(wrong)}.")
     if fingerprint != head.fingerprint:

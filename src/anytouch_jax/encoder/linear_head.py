@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from anytouch_jax.data.background.rule import gel_arrays, gels_of_arrays
+from anytouch_jax.data.background.rule import background_arrays, backgrounds_of_arrays
 from anytouch_jax.encoder.arrays import Array, Pooling
 from anytouch_jax.encoder.calibration import COVERAGE as COVERAGE
 from anytouch_jax.encoder.calibration import FALSE_ALARMS as FALSE_ALARMS
@@ -53,7 +53,7 @@ class LinearHead:
         mean: (d,), which is subtracted from features.
         scale: (d,), by which they are divided after that.
         calibration: None in files of older versions.
-        gels: pictures of the untouched gel by unit.
+        backgrounds: images of the untouched gel by unit.
     """
 
     classes: Array
@@ -66,7 +66,7 @@ class LinearHead:
     frames: int
     fingerprint: str
     calibration: Calibration | None = None
-    gels: dict[str, Array] = field(default_factory=dict)
+    backgrounds: dict[str, Array] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         classes = self.classes.tolist()
@@ -159,7 +159,7 @@ class LinearHead:
         return self.calibration.promises()
 
     def check(
-        self, source: str, fingerprint: str, pooling: str, frames: int, join: str = "mean"
+        self, source: str, fingerprint: str, pooling: str, frames: int, aggregation: str = "mean"
     ) -> None:
         """Raise UserError unless the head was fitted on such features.
 
@@ -168,9 +168,9 @@ class LinearHead:
             fingerprint: that of the encoder.
             pooling: that of the features.
             frames: those of a touch.
-            join: the temporal aggregation of a long clip.
+            aggregation: the temporal aggregation of a long clip.
         """
-        check_features_of(self, source, fingerprint, pooling, frames, join)
+        check_features_of(self, source, fingerprint, pooling, frames, aggregation)
 
     def predictions(self, features: Array) -> dict[str, Array]:
         """Return the arrays that the head adds to features (n, d) in a file.
@@ -214,10 +214,10 @@ def save_head(path: str | Path, head: Head) -> None:
         kind = NUMBER_FORMAT
     arrays = dict(vars(head))
     known = arrays.pop("calibration")
-    pictures = arrays.pop("gels")
+    images = arrays.pop("backgrounds")
     # Files name the fingerprint "mark" since the first version.
     arrays = {"mark" if name == "fingerprint" else name: value for name, value in arrays.items()}
-    arrays |= gel_arrays(pictures)
+    arrays |= background_arrays(images)
     if known is not None:
         for name, value in vars(known).items():
             arrays[f"calibration/{name}"] = np.asarray(value)
@@ -300,7 +300,7 @@ def _fields_of(arrays: dict[str, Any], formats: tuple[str, ...]) -> dict[str, An
         if not name.startswith(("calibration/", "gel"))
     }
     own["calibration"] = Calibration.from_arrays(arrays, len(arrays["mean"]))
-    own["gels"] = gels_of_arrays(arrays)
+    own["backgrounds"] = backgrounds_of_arrays(arrays)
     own["frames"] = int(own["frames"])
     own["fingerprint"] = own.pop("mark")
     return own

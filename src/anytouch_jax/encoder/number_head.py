@@ -45,7 +45,7 @@ class NumberHead:
         mean: (d,), which is subtracted from features.
         scale: (d,), by which they are divided after that.
         calibration: None where no recording was left for it.
-        gels: backgrounds by unit.
+        backgrounds: backgrounds by unit.
     """
 
     weights: Array
@@ -57,7 +57,7 @@ class NumberHead:
     frames: int
     fingerprint: str
     calibration: Calibration | None = None
-    gels: dict[str, Array] = field(default_factory=dict)
+    backgrounds: dict[str, Array] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return described(
@@ -104,10 +104,10 @@ class NumberHead:
         ]
 
     def check(
-        self, source: str, fingerprint: str, pooling: str, frames: int, join: str = "mean"
+        self, source: str, fingerprint: str, pooling: str, frames: int, aggregation: str = "mean"
     ) -> None:
         """Raise UserError unless the head was fitted on such features, see `LinearHead.check`."""
-        check_features_of(self, source, fingerprint, pooling, frames, join)
+        check_features_of(self, source, fingerprint, pooling, frames, aggregation)
 
     def predictions(self, features: Array) -> dict[str, Array]:
         """Return the arrays that the head adds to features (n, d) in a file."""

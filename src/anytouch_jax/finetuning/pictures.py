@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from anytouch_jax.data.background.rule import UnitGels
+from anytouch_jax.data.background.rule import Backgrounds
 from anytouch_jax.data.loading.samples import evaluation
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder.arrays import Array, Log
@@ -40,7 +40,7 @@ class Touches(NamedTuple):
 
 
 def read_touches(
-    encoder: Encoder, table: Manifest, rows: Array, frames: int, gels: UnitGels, log: Log
+    encoder: Encoder, table: Manifest, rows: Array, frames: int, backgrounds: Backgrounds, log: Log
 ) -> Touches:
     """Read and prepare touches once, because decoding them again in every pass takes as long.
 
@@ -49,7 +49,7 @@ def read_touches(
         table: the manifest.
         rows: row numbers (n,).
         frames: of a touch.
-        gels: backgrounds of its sensor instances.
+        backgrounds: backgrounds of its sensor instances.
         log: gets a sentence about each sensor without tokens.
     """
     for name in sorted(set(table.text_column("sensor")[rows])):
@@ -68,7 +68,7 @@ def read_touches(
         unknown="universal",
         prepare=encoder.prepare,
         like=encoder.blank,
-        gels=gels,
+        backgrounds=backgrounds,
     )
     done = 0
     for _, part in tracked(batches, "batches read", -(-len(rows) // _BATCH)):

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from anytouch_jax.data.background.rule import UnitGels
+from anytouch_jax.data.background.rule import Backgrounds
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder.arrays import Array, Log
 from anytouch_jax.encoder.base import Encoder
@@ -34,14 +34,14 @@ class Chosen(NamedTuple):
 
 
 def choose_rows(
-    table: Manifest, encoder: Encoder, gels: UnitGels, options: FinetuneOptions, log: Log
+    table: Manifest, encoder: Encoder, backgrounds: Backgrounds, options: FinetuneOptions, log: Log
 ) -> Chosen:
     """Return the rows with a label, and log how they are used.
 
     Args:
         table: the manifest.
         encoder: which may need a background.
-        gels: backgrounds of the sensor instances.
+        backgrounds: backgrounds of the sensor instances.
         options: those of the run.
         log: takes sentences.
 
@@ -57,7 +57,7 @@ def choose_rows(
         regression=options.regression,
     )
     task = task_of(table, probe)
-    rows = sources.with_gel(select_rows(table, task, probe), gels, [encoder])
+    rows = sources.with_gel(select_rows(table, task, probe), backgrounds, [encoder])
     count = len(rows.rows)
     if count > MOST_ROWS:
         rows = rows.take(_thinned(rows.groups))
@@ -69,7 +69,7 @@ def choose_rows(
     for note in rows.notes:
         log(note)
     if encoder.subtracts:
-        log(gels.report(ids))
+        log(backgrounds.report(ids))
     what = f"{len(target.names)} classes" if not is_number else "a number"
     log(
         f"{task.label}: {what}, {len(parts.fit)} touches to train on, {len(parts.val)} held out "

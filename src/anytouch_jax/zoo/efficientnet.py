@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from anytouch_jax.config import UNIVERSAL, Config, DataConfig, ModelConfig, Stack
-from anytouch_jax.encoder.arrays import Array, Join, Log, Params, Pooling, warn
+from anytouch_jax.encoder.arrays import Aggregation, Array, Log, Params, Pooling, warn
 from anytouch_jax.encoder.base import Encoder
 from anytouch_jax.shown import count_of
 from anytouch_jax.weights.keymaps import DECODER, Weights
@@ -99,7 +99,7 @@ class ConvEncoder(Encoder):
         return replace(self, params={})
 
     def traceable(
-        self, pooling: Pooling = "class", join: Join = "mean"
+        self, pooling: Pooling = "class", aggregation: Aggregation = "mean"
     ) -> Callable[..., jax.Array]:
         """Return the function from params, touches u8 (B, T, H, W, 3) and rows to features (B, E).
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from anytouch_jax.encoder.arrays import Array, Log
 from anytouch_jax.encoder.calibration import CalibrationRows, calibrate_number
@@ -31,7 +31,7 @@ class Given(NamedTuple):
 
 def make_head(linear: Linear, given: Given, options: FinetuneOptions, log: Log) -> Head:
     """Return the head of a linear function, calibrated, and log what it promises."""
-    common = {
+    common: dict[str, Any] = {
         "bias": linear.bias,
         "mean": linear.mean,
         "scale": linear.scale,

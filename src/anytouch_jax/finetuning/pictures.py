@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -12,7 +13,8 @@ from anytouch_jax.data.background.rule import Backgrounds
 from anytouch_jax.data.loading.samples import evaluation
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder.arrays import Array, Log
-from anytouch_jax.encoder.base import Encoder
+from anytouch_jax.encoder.encoder import Encoder, check_frames, load_encoder
+from anytouch_jax.errors import UserError
 from anytouch_jax.progress import tracked
 
 GREY = 128.0  # of a place that did not change, once the background is subtracted
@@ -37,6 +39,21 @@ class Touches(NamedTuple):
     def take(self, places: Array) -> Touches:
         """Return the touches at some places."""
         return Touches(self.clip[places], self.sensor[places])
+
+
+def trainable(model: str | Path, frames: int) -> Encoder:
+    """Load an encoder that can be fine-tuned on touches of `frames` frames, in float32.
+
+    Raises UserError for one of another family, and for an export.
+    """
+    encoder = load_encoder(model, engine="xla")
+    if type(encoder) is not Encoder:
+        raise UserError(
+            f"{model} cannot be fine-tuned: name an encoder of AnyTouch, or fit a head on its "
+            "frozen features with `anytouch probe label --save`."
+        )
+    check_frames(encoder.config.model, frames)
+    return encoder.computed_in("float32")
 
 
 def read_touches(

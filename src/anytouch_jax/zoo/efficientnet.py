@@ -207,8 +207,8 @@ def read_efficientnet(path: Path, weights: Mapping[str, Array], side: int | None
         raise WeightsError(f"{path} is an EfficientNet; only its lite form is computed here")
     numbers = [int(found[1]) for name in weights if (found := re.match(r"_blocks\.(\d+)\.", name))]
     params: Params = {}
-    strides = []
-    ends = []  # the last block of each stage
+    strides = list[int]()
+    ends = list[int]()  # the last block of each stage
     try:
         params["stem"] = _folded(weights, "_conv_stem", "_bn0")
         before = 0

@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from anytouch_jax.config import UNIVERSAL, ModelConfig, Stack
-from anytouch_jax.config.parsing import read_value
+from anytouch_jax.config import UNIVERSAL, ModelConfig, Stack, read_value
 from anytouch_jax.errors import ConfigError
 from anytouch_jax.nn.functional import Part
 from anytouch_jax.nn.vit import Vit, VitConfig

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from anytouch_jax.encoder.arrays import Array
 from anytouch_jax.errors import UserError
 from anytouch_jax.live.cameras import CameraSettings, LoopedVideo, open_source
 from anytouch_jax.live.examples import EXAMPLE, ExampleCamera
@@ -118,7 +117,7 @@ class Live:
     def _head_in_use(self) -> Head | None:
         return self.teacher.head or self._head
 
-    def _named(self, frame: Embedded, prepared: Array) -> dict[str, Any]:
+    def _named(self, frame: Embedded, prepared: np.ndarray) -> dict[str, Any]:
         """Return the name of a frame, by the encoder that was trained longer if there is one."""
         tuned = self.teacher.longer.tuned
         if tuned is None:

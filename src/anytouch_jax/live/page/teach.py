@@ -22,13 +22,12 @@ from anytouch_jax.live.page.feature_map import FeatureMap
 from anytouch_jax.live.page.fitting import fit_head
 from anytouch_jax.live.page.longer import LongerTraining
 from anytouch_jax.live.page.recorder import SCORE, LiveRecorder
-from anytouch_jax.live.page.shared import Stamp
 from anytouch_jax.live.page.tables import Table
 
 if TYPE_CHECKING:
     from anytouch_jax.data.manifest.manifest import Manifest
     from anytouch_jax.encoder.encoder import Encoder
-    from anytouch_jax.encoder.linear_head import LinearHead
+    from anytouch_jax.encoder.linear_head import Head
 
 _LOOK = 1.0  # seconds between looks for the recordings of other pages
 _BATCH = 4  # frames embedded at once: live touch waits for them
@@ -53,12 +52,14 @@ class Teacher:
         self._log = log
         self.head_file = recorder.out / "head.npz"
         self._features = recorder.out / "features.npz"
-        self.head: LinearHead | None = None
+        self.head: Head | None = None
         self.space: FeatureMap | None = None
         self.table: Table | None = None
         self.version = 0  # rises with every recording and every head, also of other pages
-        self._stamp: Stamp = None  # of the manifest that `table` was read from
-        self._noticed: Stamp = None  # of a manifest that was not read yet
+        self._stamp: tuple[int, int, int] | None = (
+            None  # of the manifest that `table` was read from
+        )
+        self._noticed: tuple[int, int, int] | None = None  # of a manifest that was not read yet
         self._looked = 0.0
         self._was_longer = False
         self._training = threading.Lock()
@@ -250,7 +251,7 @@ class Teacher:
             known |= {paths[place]: one for place, one in zip(unknown, values, strict=True)}
         return np.stack([known[path] for path in paths])
 
-    def _use(self, head: LinearHead) -> None:
+    def _use(self, head: Head) -> None:
         """Let live touch be named by a head that lies in the folder.
 
         Raises UserError for one of another encoder.

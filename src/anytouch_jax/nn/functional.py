@@ -88,6 +88,13 @@ class Net:
         """Return both poolings (B, E) in one pass: class token, and mean over patch tokens."""
         return self.bind(params).encode_poolings(clip, sensor, join)
 
+    def encode_sight(self, params: Params, clip: Array, sensor: Array, join: str = "mean") -> Array:
+        """Return values (B, model.sight) of the last frame of normalised clips, see `nn.sight`.
+
+        Those of a clip (B, T, H, W, 3) of several segments are joined as in `encode_touch`.
+        """
+        return self.bind(params).encode_sight(clip, sensor, join)
+
     def encode_tokens(
         self, params: Params, clip: Array, sensor: Array, keep_ids: Array | None = None
     ) -> Array:

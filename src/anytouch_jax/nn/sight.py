@@ -44,6 +44,7 @@ BLOCKS = (
     Form(5, 1, 672, 112),
 )
 READ = (0, 1, 2, 4, 7, 10)  # blocks whose means over the image are features
+MEANS = sum(BLOCKS[number].outputs for number in READ)
 # Pixels are read as (pixel - MIDDLE) / RANGE, as by EfficientNet-lite. The zeros around an image
 # are then the grey of an untouched gel, where the background is subtracted.
 MIDDLE = 127
@@ -54,7 +55,7 @@ class Sight(nnx.Module):
     """The trunk, and a linear map from means over its feature maps to `model.sight` values."""
 
     def __init__(self, model: ModelConfig) -> None:
-        self.stem = _layer(3 * 3 * 3, STEM)
+        trunk: dict[str, Any] = {"stem": _layer(3 * 3 * 3, STEM)}
         channels = STEM
         for number, form in enumerate(BLOCKS):
             own = {
@@ -64,27 +65,35 @@ class Sight(nnx.Module):
             # The first block does not widen its input.
             if number:
                 own["wide"] = _layer(channels, form.inside)
-            setattr(self, f"block{number}", nnx.Dict(own))
+            trunk[f"block{number}"] = nnx.Dict(own)
             channels = form.outputs
-        self.read = Dense(sum(BLOCKS[number].outputs for number in READ), model.sight, model)
+        self.trunk = nnx.Dict(trunk)
+        self.read = Dense(MEANS, model.sight, model)
         self.dtype = jnp.dtype(model.dtype)
 
     def __call__(self, frames: Array) -> Array:
         """Return features (B, model.sight) of normalised frames (B, H, W, 3)."""
-        return self.read(self.means(frames))
+        return self.read(feature_means(self.trunk, frames, self.dtype))
 
-    def means(self, frames: Array) -> Array:
-        """Return the means over the feature maps of `READ`, (B, their channels)."""
-        scale = 255 / RANGE * np.asarray(IMAGENET_STD)
-        shift = (255 * np.asarray(IMAGENET_MEAN) - MIDDLE) / RANGE
-        x = frames * scale[None, None, None] + shift[None, None, None]
-        x = stem(self.stem, x.astype(stored(self.dtype)), self.dtype)
-        means = []
-        for number, form in enumerate(BLOCKS):
-            x = block(getattr(self, f"block{number}"), x, form, self.dtype)
-            if number in READ:
-                means.append(jnp.mean(x, (1, 2)))
-        return jnp.concatenate(means, axis=-1)
+
+def feature_means(trunk: Any, frames: Array, dtype: DTypeLike = jnp.float32) -> Array:
+    """Return the means (B, MEANS) over the feature maps of the blocks of `READ`.
+
+    Args:
+        trunk: "stem" and "block0" to the last, as in `Sight`.
+        frames: Normalised pixels (B, H, W, 3).
+        dtype: Type of the operands of matrix products.
+    """
+    scale = 255 / RANGE * np.asarray(IMAGENET_STD)
+    shift = (255 * np.asarray(IMAGENET_MEAN) - MIDDLE) / RANGE
+    x = frames * scale[None, None, None] + shift[None, None, None]
+    x = stem(trunk["stem"], x.astype(stored(dtype)), dtype)
+    means = []
+    for number, form in enumerate(BLOCKS):
+        x = block(trunk[f"block{number}"], x, form, dtype)
+        if number in READ:
+            means.append(jnp.mean(x, (1, 2)))
+    return jnp.concatenate(means, axis=-1)
 
 
 def _layer(inputs: int, outputs: int) -> nnx.Dict:

@@ -83,7 +83,7 @@ setup: $(STAMP) ## make .venv with the pinned versions
 
 demo: $(STAMP) ## simulate, train both stages, probe and report, in 4 to 12 minutes: [DEMO= DEMO_STEPS=200, of stage 2, DEMO_STEPS1=400, of stage 1]
 	$(ANYTOUCH) data simulate --out $(DEMO)/scenes --touches 500 --objects 250 --size 128
-	test -e $(DEMO)/scenes/contact.parquet || $(ANYTOUCH) data contact $(DEMO)/scenes/manifest.parquet --share 0.6 --out $(DEMO)/scenes/contact.parquet
+	test -e $(DEMO)/scenes/contact.parquet || $(ANYTOUCH) data contact $(DEMO)/scenes/manifest.parquet --fraction 0.6 --out $(DEMO)/scenes/contact.parquet
 	$(ANYTOUCH) train --stage 1 --data $(DEMO)/scenes/contact.parquet --run $(DEMO)/stage1$(DEMO_LONGER1) $(DEMO1)
 	$(ANYTOUCH) train --stage 2 --data $(DEMO)/scenes/contact.parquet --run $(DEMO)/stage2$(DEMO_LONGER) --init $(DEMO)/stage1$(DEMO_LONGER1) $(DEMO2)
 	$(ANYTOUCH) report --data $(DEMO)/scenes/contact.parquet --stage1 $(DEMO)/stage1$(DEMO_LONGER1) --stage2 $(DEMO)/stage2$(DEMO_LONGER) --out $(DEMO)/report$(DEMO_LONGER)
@@ -162,7 +162,7 @@ corpus: $(STAMP) ## simulated touches on disk, of which the encoders are asked f
 weights: $(STAMP) ## train an encoder on endless touches for a time, and go on later: [MINUTES=12 REAL="a.csv b.csv" WEIGHTS=runs/anytouch-tiny]
 	$(PY) -m experiments.encoders.train --minutes $(MINUTES) --real $(REAL) --out $(WEIGHTS)
 
-figures: $(STAMP) ## after new weights: measure the shipped encoder, then the results, pictures, notebooks and pages that show it: [TOUCH=manifest of real touch]
+figures: $(STAMP) ## after new weights: measure the shipped encoder, then the results, images, notebooks and pages that show it: [TOUCH=manifest of real touch]
 	$(PY) -m experiments.real.run anytouch-tiny untrained:anytouch-tiny$(if $(TOUCH), --data $(TOUCH))
 	$(PY) -m experiments.real.run anytouch-tiny --untouched median$(if $(TOUCH), --data $(TOUCH))
 	$(PY) -m experiments.encoders.picture docs/pictures/first_touch.png

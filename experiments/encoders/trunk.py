@@ -23,7 +23,7 @@ import jax
 import numpy as np
 from jax import Array
 
-from anytouch_jax.data.background.rule import UnitGels
+from anytouch_jax.data.background.rule import Backgrounds
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.transforms import subtract_background, touch_evaluation
@@ -67,7 +67,7 @@ def real_touches(path: Path) -> RealTouches:
     first "_".
     """
     manifest = manifests.read(path)
-    gel_of = UnitGels(manifest).shared(lambda picture: picture)
+    gel_of = Backgrounds(manifest).shared(lambda picture: picture)
     images = []
     kept = []
     for row in manifest.rows_of("train"):

@@ -1,4 +1,4 @@
-"""The simulated scenes and the pictures of the notebooks."""
+"""The simulated scenes and the images of the notebooks."""
 
 from __future__ import annotations
 
@@ -71,8 +71,8 @@ def embed(encoder: at.Encoder, table: at.Manifest, rows: np.ndarray) -> np.ndarr
     return embed_rows(encoder, table, rows, pooling="both", log=silent)[1]
 
 
-def small_pictures(table: at.Manifest, rows: np.ndarray) -> np.ndarray:
-    """Return the change of pictures from the untouched gel as features (n, d): what needs no
+def small_images(table: at.Manifest, rows: np.ndarray) -> np.ndarray:
+    """Return the change of images from the untouched gel as features (n, d): what needs no
     encoder.
     """
     size = (24, 24)
@@ -85,26 +85,26 @@ def small_pictures(table: at.Manifest, rows: np.ndarray) -> np.ndarray:
 
 
 def show(
-    pictures: Sequence[np.ndarray], titles: Sequence[str], across: int, size: float = 1.7
+    images: Sequence[np.ndarray], titles: Sequence[str], across: int, size: float = 1.7
 ) -> None:
-    """Show pictures in rows of `across`, each with a title."""
-    down = -(-len(pictures) // across)
+    """Show images in rows of `across`, each with a title."""
+    down = -(-len(images) // across)
     figure, axes = plt.subplots(
         down, across, figsize=(size * across, (size + 0.2) * down), squeeze=False
     )
     for axis in axes.flat:
         axis.axis("off")
-    for axis, picture, title in zip(axes.flat, pictures, titles, strict=False):
-        axis.imshow(picture)
+    for axis, image, title in zip(axes.flat, images, titles, strict=False):
+        axis.imshow(image)
         axis.set_title(title, fontsize=8)
     figure.tight_layout()
     plt.show()
 
 
 def show_file(path: Path, width: float = 10) -> None:
-    """Show a picture file."""
-    picture = plt.imread(path)
-    plt.figure(figsize=(width, width * picture.shape[0] / picture.shape[1]))
-    plt.imshow(picture)
+    """Show an image file."""
+    image = plt.imread(path)
+    plt.figure(figsize=(width, width * image.shape[0] / image.shape[1]))
+    plt.imshow(image)
     plt.axis("off")
     plt.show()

@@ -11,7 +11,7 @@ import numpy as np
 from experiments.pages.page import RECORDS, Finding, Page
 from experiments.pouring import table as pours
 from experiments.records import check_alike, read_records
-from experiments.tables import paper, pictures
+from experiments.tables import images, paper
 from experiments.tables.columns import FORM, FOUR, MOVING, SIX, title
 from experiments.tables.results import Column, Matrix
 from experiments.translation.settings import PIXELS, TRANSLATIONS, TRANSLATORS, TUNES, shared
@@ -57,7 +57,7 @@ def space(folder: Path) -> Page:
     """Figure 4."""
     of = Matrix(folder / "matrix.jsonl", "q2")
     names = ("pixels", "contact", "untrained", "masked", "aligned", "matched", "matched_mlp")
-    top = [Column("class token", "top-1", "share")]
+    top = [Column("class token", "top-1", "fraction")]
     sensor, thing = (
         [Column("class token", f"silhouette by {one}", f"silhouette by {one}", 1.0)]
         for one in ("sensor", "object")
@@ -76,7 +76,7 @@ def space(folder: Path) -> Page:
         finding(of, a, b, columns, columns[0].task, unit="", form=".3f") for a, b, columns in pairs
     ]
     rows = [(title(name), *(of.value(name, one) for one in (top, sensor, thing))) for name in names]
-    return Page("space", [rows], findings, figure=partial(pictures.q2, of.runs))
+    return Page("space", [rows], findings, figure=partial(images.q2, of.runs))
 
 
 def ablations(folder: Path) -> Page:

@@ -10,7 +10,7 @@ from typing import Any
 TASKS = (("gelsight_mini", "duragel"), ("gelsight_mini", "tac3d"), ("digit", "tac3d"))
 TRANSLATIONS = dict(
     zip(
-        map("-".join, TASKS),
+        map("-".aggregation, TASKS),
         ("GelSight Mini to DuraGel", "GelSight Mini to Tac3D", "DIGIT to Tac3D"),
         strict=True,
     )
@@ -29,7 +29,7 @@ def shared(about: Mapping[str, Any]) -> dict[str, Any]:
     """Return what the settings of runs must share by name: the view of a touch, an encoder a seed,
     pairs a task.
 
-    Errors of pictures of another size are no rivals.
+    Errors of images of another size are no rivals.
     """
     task = f"{about['from']} to {about['to']}"
     fit = about["fit"]

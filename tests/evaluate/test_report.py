@@ -31,8 +31,8 @@ from anytouch_jax.weights import checkpoint
 NAMES = (RANDOM, "stage 1", "stage 2")
 
 
-def pictures_of(report: Path) -> list[Path]:
-    """The figures that a report shows; every one must be a readable picture beside it."""
+def images_of(report: Path) -> list[Path]:
+    """The figures that a report shows; every one must be a readable image beside it."""
     found = [
         report.parent / one for one in re.findall(r"!\[[^]]*\]\(([^)]+)\)", report.read_text())
     ]
@@ -113,7 +113,7 @@ def test_a_report_has_its_parts_in_order(tmp_path: Path) -> None:
         "| a | b\\|c |\n| --- | --- |\n| 1 | two lines |\n\nAfter.\n\n## "
         "Second\n\n![Second](figures/mine.png)\n"
     )
-    assert [one.name for one in pictures_of(path)] == ["shot.png", "mine.png"]
+    assert [one.name for one in images_of(path)] == ["shot.png", "mine.png"]
     plain = json.loads((out / "report.json").read_text())
     assert (plain["x"], plain["bad"], plain["list"], plain["path"]) == (0.5, None, [0, 1], "a")
     assert plain["part"]["title"] == "Second"
@@ -173,7 +173,7 @@ def test_the_demo_report_holds_everything(demo: tuple[Path, list[str]]) -> None:
         "Cross-sensor matching",
         "Probes",
     ]
-    names = [one.name for one in pictures_of(path)]
+    names = [one.name for one in images_of(path)]
     assert names == [
         "samples_coarse.png",
         "samples_fine.png",

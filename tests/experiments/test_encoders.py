@@ -32,7 +32,7 @@ RNG = np.random.default_rng(0)
 
 @pytest.mark.slow
 def test_it_learns_a_field_that_no_mean_shows(monkeypatch):
-    """The first two values of a token change with the field of a turn, whose mean over the picture
+    """The first two values of a token change with the field of a turn, whose mean over the image
     is zero.
     """
     monkeypatch.setattr(motion, "EPOCHS", 30)
@@ -48,7 +48,7 @@ def test_it_learns_a_field_that_no_mean_shows(monkeypatch):
     clips = motion.Clips(tokens, turn, np.full(n, "none"), np.full(n, "digit"), split, np.arange(n))
     splits = {name: np.flatnonzero(split == name) for name in ("train", "val", "test")}
     found = motion.score(motion.fit(clips, splits["train"], splits["val"]), clips, splits["test"])
-    assert found["turn"]["share"] > 0.95 and found["slide"]["clips"] == 0
+    assert found["turn"]["fraction"] > 0.95 and found["slide"]["clips"] == 0
     assert motion.pooled_score(clips, splits) < 0.75
 
 
@@ -62,7 +62,7 @@ def test_a_perfect_encoder_finds_every_touch_and_noise_finds_chance(tmp_path, mo
 
     monkeypatch.setattr(lookalikes, "embed_rows", embed)
     record = lookalikes.recall({"a": "perfect", "b": "noise"}, data)
-    scores = {name: one["share"] for name, one in record["scores"].items()}
+    scores = {name: one["fraction"] for name, one in record["scores"].items()}
     assert set(scores) == {"a", "b", "pixels"} and record["touches"] == 52 * 3
     assert scores["a"] == 1.0 and scores["b"] < 0.1
     write_record(tmp_path / "lookalikes.jsonl", "fine", record | {"encoders": {"a": "mark"}})

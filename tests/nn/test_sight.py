@@ -66,17 +66,17 @@ def test_the_trunk_joins_the_features_and_changes_none(
 ) -> None:
     without = {name: part for name, part in params["touch"].items() if name != "sight"}
     plain = touch_features(
-        {"touch": without}, CLIPS, ROWS, net=build(PLAIN.model), pooling=pooling, join="mean"
+        {"touch": without}, CLIPS, ROWS, net=build(PLAIN.model), pooling=pooling, aggregation="mean"
     )
     joined = touch_features(
-        params, CLIPS, ROWS, net=build(SEEING.model), pooling=pooling, join="mean"
+        params, CLIPS, ROWS, net=build(SEEING.model), pooling=pooling, aggregation="mean"
     )
     width = parts * SEEING.model.embed
     assert joined.shape == (2, width + 24)
     np.testing.assert_array_equal(joined[:, :width], plain)
     # The last frame alone is seen.
     still = touch_features(
-        params, CLIPS[:, -1:], ROWS, net=build(SEEING.model), pooling=pooling, join="mean"
+        params, CLIPS[:, -1:], ROWS, net=build(SEEING.model), pooling=pooling, aggregation="mean"
     )
     np.testing.assert_allclose(joined[:, width:], still[:, width:], rtol=1e-4, atol=1e-5)
     assert np.ptp(joined[:, width:], axis=0).min() > 0
@@ -85,8 +85,8 @@ def test_the_trunk_joins_the_features_and_changes_none(
 def test_segments_are_joined_as_those_of_the_transformer(params: dict[str, jax.Array]) -> None:
     net = build(SEEING.model)
     long = np.concatenate([CLIPS, CLIPS[:, ::-1]], axis=1)
-    wide = touch_features(params, long, ROWS, net=net, pooling="class", join="concat")
-    mean = touch_features(params, long, ROWS, net=net, pooling="class", join="mean")
+    wide = touch_features(params, long, ROWS, net=net, pooling="class", aggregation="concat")
+    mean = touch_features(params, long, ROWS, net=net, pooling="class", aggregation="mean")
     segments = (wide.shape[1]) // (SEEING.model.embed + 24)
     own = wide[:, segments * SEEING.model.embed :].reshape(2, segments, 24)
     np.testing.assert_allclose(own.mean(1), mean[:, SEEING.model.embed :], rtol=1e-4, atol=1e-5)
@@ -99,7 +99,7 @@ def test_fields_and_features_of_one_pass_are_those_of_two() -> None:
     aspect = np.zeros(2, np.float32)
     features, out = features_and_fields(params, CLIPS, ROWS, aspect, net=net, pooling="both")
     assert isinstance(out, FieldOutput)
-    alone = touch_features(params, CLIPS, ROWS, net=net, pooling="both", join="mean")
+    alone = touch_features(params, CLIPS, ROWS, net=net, pooling="both", aggregation="mean")
     np.testing.assert_allclose(features, alone, rtol=1e-4, atol=1e-5)
 
 
@@ -120,7 +120,7 @@ def test_the_graph_of_onnx_sees_the_same(params: dict[str, jax.Array]) -> None:
     from anytouch_jax.export.graph import touch_graph
 
     live = touch_features(
-        params, CLIPS, ROWS, net=build(SEEING.model), pooling="class", join="mean"
+        params, CLIPS, ROWS, net=build(SEEING.model), pooling="class", aggregation="mean"
     )
     run = engines.session(touch_graph({"touch": params["touch"]}, SEEING.model, 3))
     seen = run(CLIPS, ROWS)

@@ -325,8 +325,8 @@ def group_weights(groups: Array) -> Array:
     return 1 / (counts[ids] * len(counts))
 
 
-def conformal_limit(scores: Array, groups: Array, share: float) -> float:
-    """Return the limit that a score of a new group is at most with probability `share`.
+def conformal_limit(scores: Array, groups: Array, fraction: float) -> float:
+    """Return the limit that a score of a new group is at most with probability `fraction`.
 
     Groups have equal weight. Two limits are computed, and the lower one counts:
 
@@ -339,15 +339,15 @@ def conformal_limit(scores: Array, groups: Array, share: float) -> float:
     Args:
         scores: (n,), finite or infinite.
         groups: (n,).
-        share: the probability, between 0 and 1.
+        fraction: the probability, between 0 and 1.
 
     Raises:
-        UserError: a `share` outside 0..1, no scores, or NaN.
+        UserError: a `fraction` outside 0..1, no scores, or NaN.
     """
     scores = np.asarray(scores, np.float64)
     groups = np.asarray(groups)
-    if not isinstance(share, int | float | np.number) or not 0 < share < 1:
-        raise UserError(f"A coverage must lie between 0 and 1, not {share!r}.")
+    if not isinstance(fraction, int | float | np.number) or not 0 < fraction < 1:
+        raise UserError(f"A coverage must lie between 0 and 1, not {fraction!r}.")
     if not scores.size or scores.shape != groups.shape or np.isnan(scores).any():
         raise UserError(
             f"A limit needs scores (n,) without NaN and as many groups, not {scores.shape} "
@@ -361,7 +361,7 @@ def conformal_limit(scores: Array, groups: Array, share: float) -> float:
     mass = np.cumsum(weights)  # of all rows up to each
     # The further group takes 1 / (count + 1) of the mass, and lies behind all scores.
     with_one_more = mass * count / (count + 1)
-    place = int(np.searchsorted(with_one_more, share - _ROUNDING))
+    place = int(np.searchsorted(with_one_more, fraction - _ROUNDING))
     if place == len(scores):
         return np.inf
 
@@ -373,10 +373,10 @@ def conformal_limit(scores: Array, groups: Array, share: float) -> float:
     # The mass of the others up to each row, where the others alone are the whole.
     below = (mass - own) * count / max(count - 1, 1)
     # `level` is the mass of the others up to which a limit must reach, so that of all rows, weighed
-    # by group, `share` lie below the limit of their group.
+    # by group, `fraction` lie below the limit of their group.
     turn = np.argsort(below, kind="stable")
     covered = np.cumsum(weights[turn])
-    last = int(np.searchsorted(covered, share - _ROUNDING))
+    last = int(np.searchsorted(covered, fraction - _ROUNDING))
     level = below[turn][min(last + 1, len(turn) - 1)]
     by_others = int(np.searchsorted(mass, level - _ROUNDING))
     return float(scores[min(place, by_others)])

@@ -16,7 +16,7 @@ import numpy as np
 from anytouch_jax.batch import FieldOutput
 from anytouch_jax.config import Config, ModelConfig
 from anytouch_jax.encoder import arrays
-from anytouch_jax.encoder.arrays import Join, Params, Pooling
+from anytouch_jax.encoder.arrays import Aggregation, Params, Pooling
 from anytouch_jax.errors import UserError, refuse_forked
 from anytouch_jax.nn.attention import usable
 from anytouch_jax.nn.functional import Net, build
@@ -50,15 +50,24 @@ def as_clips(frames: Any) -> np.ndarray:
     return frames
 
 
-def check_choices(pooling: Pooling, join: Join) -> None:
+def check_choices(pooling: Pooling, aggregation: Aggregation) -> None:
     """Raise UserError for another pooling or join than there are."""
-    for name, value, kind in (("pooling", pooling, Pooling), ("join", join, Join)):
+    for name, value, kind in (
+        ("pooling", pooling, Pooling),
+        ("aggregation", aggregation, Aggregation),
+    ):
         if value not in get_args(kind):
             raise UserError(f"{name} is one of {', '.join(get_args(kind))}, not {value!r}")
 
 
 def touch_features(
-    params: Params, clips: jax.Array, sensor: jax.Array, *, net: Net, pooling: Pooling, join: Join
+    params: Params,
+    clips: jax.Array,
+    sensor: jax.Array,
+    *,
+    net: Net,
+    pooling: Pooling,
+    aggregation: Aggregation,
 ) -> jax.Array:
     """Return features f32 (B, E): a traceable `encode_touch`.
 
@@ -68,18 +77,18 @@ def touch_features(
         sensor: rows (B,) of the sensor table.
         net: the network of these parameters.
         pooling: see `Encoder.encode_touch`.
-        join: see `Encoder.encode_touch`.
+        aggregation: see `Encoder.encode_touch`.
     """
-    check_choices(pooling, join)
+    check_choices(pooling, aggregation)
     clips = normalise_touch(clips)
     if pooling == "class":
-        values = [net.encode_touch(params, clips, sensor, join)]
+        values = [net.encode_touch(params, clips, sensor, aggregation)]
     else:
         # XLA drops the class token where it is not used, so "mean" costs no more than it needs.
-        both = net.encode_poolings(params, clips, sensor, join)
+        both = net.encode_poolings(params, clips, sensor, aggregation)
         values = [*(both if pooling == "both" else both[1:])]
     if net.model.sight:
-        values.append(net.encode_sight(params, clips, sensor, join))
+        values.append(net.encode_sight(params, clips, sensor, aggregation))
     return jnp.concatenate(values, axis=-1).astype(jnp.float32)
 
 
@@ -98,7 +107,7 @@ def features_and_fields(
         params: those of touch encoder and fields.
         clips: u8 (B, T, H, W, 3).
         sensor: rows (B,) of the sensor table.
-        aspect: (B,), logarithms of the pictures' height over width.
+        aspect: (B,), logarithms of the images' height over width.
         net: the network of these parameters.
         pooling: that of the features.
     """

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from anytouch_jax.data.background.rule import gel_arrays, gels_of_arrays
+from anytouch_jax.data.background.rule import background_arrays, backgrounds_of_arrays
 from anytouch_jax.encoder.arrays import Array, Pooling
 from anytouch_jax.encoder.calibration import COVERAGE as COVERAGE
 from anytouch_jax.encoder.calibration import FALSE_ALARMS as FALSE_ALARMS
@@ -46,7 +46,7 @@ class LinearHead:
         mean: (d,), which is subtracted from features.
         scale: (d,), by which they are divided after that.
         calibration: None in files of older versions.
-        gels: pictures of the untouched gel by unit.
+        backgrounds: images of the untouched gel by unit.
     """
 
     classes: Array
@@ -59,7 +59,7 @@ class LinearHead:
     frames: int
     fingerprint: str
     calibration: Calibration | None = None
-    gels: dict[str, Array] = field(default_factory=dict)
+    backgrounds: dict[str, Array] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         classes = self.classes.tolist()
@@ -155,7 +155,7 @@ class LinearHead:
         return self.calibration.promises()
 
     def check(
-        self, source: str, fingerprint: str, pooling: str, frames: int, join: str = "mean"
+        self, source: str, fingerprint: str, pooling: str, frames: int, aggregation: str = "mean"
     ) -> None:
         """Raise UserError unless the head was fitted on such features.
 
@@ -164,15 +164,15 @@ class LinearHead:
             fingerprint: that of the encoder.
             pooling: that of the features.
             frames: those of a touch.
-            join: the temporal aggregation of a long clip.
+            aggregation: the temporal aggregation of a long clip.
         """
         wrong = []
         if pooling != self.pooling:
             wrong.append(f"--pooling {self.pooling}")
         if frames != self.frames:
             wrong.append(f"--frames {self.frames}")
-        if join != "mean":  # heads are fitted on no other
-            wrong.append("--join mean")
+        if aggregation != "mean":  # heads are fitted on no other
+            wrong.append("--aggregation mean")
         if wrong:
             raise UserError(f"The head was fitted on other features. Give {' '.join(wrong)}.")
         if fingerprint != self.fingerprint:
@@ -186,10 +186,10 @@ def save_head(path: str | Path, head: LinearHead) -> None:
     """Write a head as `.npz` atomically. Raises OSError."""
     arrays = dict(vars(head))
     known = arrays.pop("calibration")
-    pictures = arrays.pop("gels")
+    images = arrays.pop("backgrounds")
     # Files name the fingerprint "mark" since the first version.
     arrays = {"mark" if name == "fingerprint" else name: value for name, value in arrays.items()}
-    arrays |= gel_arrays(pictures)
+    arrays |= background_arrays(images)
     if known is not None:
         for name, value in vars(known).items():
             arrays[f"calibration/{name}"] = np.asarray(value)
@@ -229,7 +229,7 @@ def _head_of(arrays: dict[str, Any]) -> LinearHead:
         raise ValueError("it has no format of a head")
     check_array("frames", arrays["frames"], (), "iu")
     known = Calibration.from_arrays(arrays, len(arrays["mean"]))
-    gels = gels_of_arrays(arrays)
+    backgrounds = backgrounds_of_arrays(arrays)
     own = {
         name: value
         for name, value in arrays.items()
@@ -237,7 +237,9 @@ def _head_of(arrays: dict[str, Any]) -> LinearHead:
     }
     frames = int(own.pop("frames"))
     fingerprint = own.pop("mark")
-    return LinearHead(calibration=known, gels=gels, frames=frames, fingerprint=fingerprint, **own)
+    return LinearHead(
+        calibration=known, backgrounds=backgrounds, frames=frames, fingerprint=fingerprint, **own
+    )
 
 
 def _check_head(head: LinearHead) -> None:

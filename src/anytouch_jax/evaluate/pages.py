@@ -82,7 +82,7 @@ def write_report(
 
 
 def html_page(text: str, folder: Path, title: str) -> str:
-    """Return Markdown as one HTML page with the pictures of `folder`/figures inside.
+    """Return Markdown as one HTML page with the images of `folder`/figures inside.
 
     HTML in the Markdown is shown as text, and no script runs.
     """

@@ -33,7 +33,7 @@ _LEGEND = 12  # more names than that are colours without a legend
 
 # The geometry of feature spaces was defined here.
 __all__ = [
-    "ShareBar",
+    "FractionBar",
     "Space",
     "alignment",
     "bars",
@@ -51,7 +51,7 @@ __all__ = [
 ]
 
 
-class ShareBar(NamedTuple):
+class FractionBar(NamedTuple):
     """A fraction (0..1) with its interval and the chance level; None is not drawn."""
 
     value: float
@@ -163,7 +163,7 @@ def sample_grid(
     rows: Sequence[str],
     columns: Sequence[str],
 ) -> None:
-    """Draw a grid of pictures RGB u8 (h, w, 3), or fields (h, w) as colour maps.
+    """Draw a grid of images RGB u8 (h, w, 3), or fields (h, w) as colour maps.
 
     None is an empty cell. `rows` and `columns` are their titles.
     """
@@ -192,7 +192,9 @@ def sample_grid(
     write_figure(path, figure)
 
 
-def bars(path: Path, series: Mapping[str, Mapping[str, ShareBar]], *, label: str = "share") -> None:
+def bars(
+    path: Path, series: Mapping[str, Mapping[str, FractionBar]], *, label: str = "fraction"
+) -> None:
     """Draw horizontal bars of fractions with their intervals; dashes mark chance.
 
     `series` is {panel: {name: ShareBar}}.

@@ -1,4 +1,4 @@
-"""Reconstruction errors of stage 1 on masked pixels, guesses without a model, and pictures."""
+"""Reconstruction errors of stage 1 on masked pixels, guesses without a model, and images."""
 
 from __future__ import annotations
 
@@ -167,8 +167,8 @@ def reconstruction_panels(
     gap = ((0, 0), (0, 0), (0, _GAP), (0, _GAP), (0, 0))
     columns = []
     for name, block in blocks.items():
-        pictures = np.pad(block, gap, constant_values=255)  # (B, T, h, w, 3)
-        column = pictures.transpose(0, 2, 1, 3, 4).reshape(len(block) * (size + _GAP), -1, 3)
+        images = np.pad(block, gap, constant_values=255)  # (B, T, h, w, 3)
+        column = images.transpose(0, 2, 1, 3, 4).reshape(len(block) * (size + _GAP), -1, 3)
         title = np.full((_TITLE, column.shape[1], 3), 255, np.uint8)
         cv2.putText(
             title, name, (2, _TITLE - 4), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 0, 0), 1, cv2.LINE_AA

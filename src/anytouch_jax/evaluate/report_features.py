@@ -12,7 +12,7 @@ from anytouch_jax.evaluate import plots, probing
 from anytouch_jax.evaluate.feature_cache import principal_components
 from anytouch_jax.evaluate.heads import ProbeHead
 from anytouch_jax.evaluate.pages import Section
-from anytouch_jax.evaluate.plots import ShareBar
+from anytouch_jax.evaluate.plots import FractionBar
 from anytouch_jax.evaluate.probing import ProbeResult
 from anytouch_jax.evaluate.report_study import PIXELS, Study
 from anytouch_jax.evaluate.tables import listed_notes, markdown_table
@@ -92,14 +92,14 @@ def probes_section(study: Study, out: Path) -> tuple[Section, dict[str, Any]]:
             notes.append(f"{label}: the manifest has no column label.{label}")
             continue
         values = [table.value(int(row), f"label.{label}") for row in rows]
-        measured = any(isinstance(value, float) and value % 1 for value in values)
+        regression = any(isinstance(value, float) and value % 1 for value in values)
         scored = list[ProbeResult]()
         try:
             for name, x in features.items():
                 # Principal components share one scale: unit spread for each would amplify the
                 # smallest.
                 head = ProbeHead("linear", "common" if name == PIXELS else "column")
-                options: dict[str, Any] = {"measured": measured, "name": name, "seeds": 0}
+                options: dict[str, Any] = {"regression": regression, "name": name, "seeds": 0}
                 scored.append(
                     probing.probe_features(x, values, groups, study.split, head, **options)
                 )
@@ -109,10 +109,10 @@ def probes_section(study: Study, out: Path) -> tuple[Section, dict[str, Any]]:
             results[label] = scored
     bars = {
         label: {
-            one.probe: ShareBar(one.accuracy, one.low, one.high, one.baseline) for one in scored
+            one.probe: FractionBar(one.accuracy, one.low, one.high, one.baseline) for one in scored
         }
         for label, scored in results.items()
-        if not scored[0].measured
+        if not scored[0].regression
     }
     path = out / "figures" / "probes.png"
     if bars:

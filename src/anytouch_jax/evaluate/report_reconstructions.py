@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from anytouch_jax.data.background.rule import UnitGels
+from anytouch_jax.data.background.rule import Backgrounds
 from anytouch_jax.data.images import encode
 from anytouch_jax.data.loading.samples import evaluation
 from anytouch_jax.data.manifest.manifest import Manifest
@@ -33,10 +33,10 @@ def reconstructions_section(
     params = encoder.params | {"decoder": encoder.part_params("decoder")}
     rows = with_images(manifest, manifest.rows_of("test"))
     frames = config.model.frames + 1
-    rows = rows_with_gel(encoder, UnitGels(manifest), rows, lambda _: None)
+    rows = rows_with_gel(encoder, Backgrounds(manifest), rows, lambda _: None)
     ends = rows[:0]
     # Without clips in training the head for the next frame is untrained.
-    if config.objective.next_frame and config.data.clip_share > 0:
+    if config.objective.next_frame and config.data.clip_fraction > 0:
         ends = np.intersect1d(manifest.clips(frames, "test")[:, -1], rows)
     scores = contact_errors(params, manifest, ends, encoder)
     kind: Literal["still", "clip"] = "clip"
@@ -54,8 +54,8 @@ def reconstructions_section(
     path = folder / "figures" / "reconstructions.png"
     atomic_write(path, encode(image))
     names = ", ".join(map(as_text, manifest.text_column("sensor")[rows]))
-    share = f"{config.objective.keep_ratio:.0%}".replace("%", " %")
-    text = f"Stage 1 reads {share} of the patches of a held-out object. From above: {names}."
+    fraction = f"{config.objective.keep_ratio:.0%}".replace("%", " %")
+    text = f"Stage 1 reads {fraction} of the patches of a held-out object. From above: {names}."
     title = "Reconstructions"
     table = ""
     if frames > 1:

@@ -12,7 +12,7 @@ from anytouch_jax.encoder.encoder import Encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import plots, retrieval
 from anytouch_jax.evaluate.pages import Section
-from anytouch_jax.evaluate.plots import ShareBar
+from anytouch_jax.evaluate.plots import FractionBar
 from anytouch_jax.evaluate.report_rows import grades_of
 from anytouch_jax.evaluate.report_study import PIXELS, VECTOR, Study, baseline
 from anytouch_jax.evaluate.retrieval import GALLERY
@@ -101,7 +101,7 @@ def retrieval_section(
             if other == kind and not centred
         }
         panels[f"{grade}, gallery {kind}"] = {
-            name: ShareBar(result.top1, result.low, result.high, result.chance1)
+            name: FractionBar(result.top1, result.low, result.high, result.chance1)
             for name, result in plain.items()
         }
         others = [name for name in plain if name != best] if best in plain else []

@@ -60,9 +60,9 @@ def facts_section(table: Manifest, first: Encoder, second: Encoder, lineage: str
 
 
 def samples_section(manifest: Manifest, folder: Path, *, seed: int = 0) -> list[Section]:
-    """Return a section for each grade of alignment: pictures of touches, and captions.
+    """Return a section for each grade of alignment: images of touches, and captions.
 
-    A picture has a touch a row and a sensor a column.
+    An image has a touch a row and a sensor a column.
     """
     rows = deepest_rows(manifest)
     sections = []
@@ -85,7 +85,7 @@ def samples_section(manifest: Manifest, folder: Path, *, seed: int = 0) -> list[
             photo = None
             if pictured:
                 photo = decode(manifest.file(pictured[0], "image_path"))
-            images.append([_picture(manifest, row_of.get(name)) for name in names] + [photo])
+            images.append([_image(manifest, row_of.get(name)) for name in names] + [photo])
             titles.append(str(objects[touch == code][0]) or f"touch {code}")
             captions.append(next((" ".join(text.split()) for text in texts if text), "no caption"))
         name = "samples"
@@ -115,7 +115,7 @@ def _varied_touches(touch: Array, sensor: Array, objects: Array, seed: int) -> l
     return codes[order[np.argsort(came_before, kind="stable")]][:_SHOWN].tolist()
 
 
-def _picture(manifest: Manifest, row: int | None) -> Array | None:
+def _image(manifest: Manifest, row: int | None) -> Array | None:
     """Return the frame of a row, None without a row.
 
     Of a force-field sensor it is the length of its displacement (three channels) in mm.

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from anytouch_jax.config import preset
-from anytouch_jax.data.background.rule import ADVICE, UnitGels
+from anytouch_jax.data.background.rule import ADVICE, Backgrounds
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder.arrays import Array
 from anytouch_jax.encoder.encoder import Encoder, check_frames, load_encoder, random_encoder
@@ -32,7 +32,7 @@ def _encoder_of(model: Encoder | FeatureSource) -> Encoder | None:
     return model
 
 
-def with_gel(rows: TaskRows, gels: UnitGels, models: Opened) -> TaskRows:
+def with_gel(rows: TaskRows, backgrounds: Backgrounds, models: Opened) -> TaskRows:
     """Return the rows that all models can read, for those that need a background.
 
     All sources are probed on the same rows, or their scores could not be compared in pairs. Raises
@@ -41,15 +41,14 @@ def with_gel(rows: TaskRows, gels: UnitGels, models: Opened) -> TaskRows:
     encoders = [_encoder_of(model) for model in models]
     if not any(encoder is not None and encoder.needs_background for encoder in encoders):
         return rows
-    has = np.all(gels.has(rows.rows.ravel()).reshape(rows.rows.shape), axis=1)
+    has = np.all(backgrounds.has(rows.rows.ravel()).reshape(rows.rows.shape), axis=1)
     if not has.any():
         raise UserError(
-            f"None of {len(rows.rows)} rows has a picture of the untouched gel to subtract. "
-            f"{ADVICE}"
+            f"None of {len(rows.rows)} rows has an image of the untouched gel to subtract. {ADVICE}"
         )
     notes = rows.notes
     if not has.all():
-        notes += (f"{(~has).sum()} rows are left out: they have no picture of the untouched gel",)
+        notes += (f"{(~has).sum()} rows are left out: they have no image of the untouched gel",)
     return rows.take(np.flatnonzero(has))._replace(notes=notes)
 
 
@@ -66,7 +65,7 @@ def _random_source(table: Manifest, models: Opened, encoding: Encoding) -> Featu
 def _pixel_source(table: Manifest, models: Opened, encoding: Encoding) -> FeatureSource:
     """Return raw pixels, which share one scale: unit spread for each would amplify noise."""
     store = feature_cache.pixel_features(
-        table, order=encoding.order, folder=encoding.folder, gels=encoding.gels
+        table, order=encoding.order, folder=encoding.folder, backgrounds=encoding.backgrounds
     )
     return FeatureSource(RAW, store, None, "common", is_control=True)
 

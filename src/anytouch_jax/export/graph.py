@@ -354,7 +354,7 @@ class _FieldGraph:
         quarter = (self._half + 1) // 2
         eighth = (self._half + 3) // 4
         deep = self._refined(self._convolved(x, "deep", 2), "deep1", "deep2")
-        # The whole picture shows the lights of the unit.
+        # The whole image shows the lights of the unit.
         mean = graph("ReduceMean", deep, [1, 2], keepdims=1)
         light = graph.dense(graph("Gelu", mean), self._own["light"])
         deep = self._refined(graph("Add", deep, light), "deep3", "deep4")

@@ -179,13 +179,13 @@ def write_encoder(
     return folder
 
 
-# What a model card says of the picture of the untouched gel, by `data.background`.
+# What a model card says of the image of the untouched gel, by `data.background`.
 _SUBTRACTED = {
-    "subtract": "It needs the picture of the untouched gel, which is subtracted.",
+    "subtract": "It needs the image of the untouched gel, which is subtracted.",
     "either": (
-        "A picture of the untouched gel is subtracted if you give one. It also works without."
+        "An image of the untouched gel is subtracted if you give one. It also works without."
     ),
-    "keep": "The picture of the untouched gel is not used.",
+    "keep": "The image of the untouched gel is not used.",
 }
 
 

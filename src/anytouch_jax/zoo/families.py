@@ -62,12 +62,12 @@ def _refuse_relatives(path: Path, weights: Weights) -> None:
     ]
     if any(key.endswith(patch) and x.ndim == 2 for key, x in weights.items()):
         reasons = [
-            "is the NaFlex form of SigLIP 2, for pictures of any shape; give one of a fixed size"
+            "is the NaFlex form of SigLIP 2, for images of any shape; give one of a fixed size"
         ]
     elif timm is None and not any("patch_embeddings." in key for key in weights):
         reasons = []
     elif timm is not None and timm.ndim == 4 and timm.shape[1] == 3 and "cls_token" not in weights:
-        reasons.append("is a ViT of photographs without a class token; give one that has it")
+        reasons.append("is a ViT of RGB images without a class token; give one that has it")
     if reasons:
         raise WeightsError(f"{path} {reasons[0]}")
 

@@ -16,10 +16,10 @@ from anytouch_jax.zoo.families import FamilyModel
 from anytouch_jax.zoo.table import IMAGES
 
 
-def touch_of_photographs(
+def touch_of_rgb_images(
     model: FamilyModel, source: str, config: Config, fresh: dict[str, Any]
 ) -> tuple[dict[str, Any], list[str]]:
-    """Return a touch encoder that gives a still the tokens of a ViT of photographs, and sentences
+    """Return a touch encoder that gives a still the tokens of a ViT of RGB images, and sentences
     to log.
 
     The patch kernel is divided among the frames. Its bias goes into the resized positions, and

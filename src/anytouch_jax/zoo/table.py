@@ -104,7 +104,7 @@ class Family:
 
 _APACHE = "Apache-2.0"
 _NON_COMMERCIAL = "CC BY-NC 4.0: non-commercial"
-IMAGES = "photographs, no touch"
+IMAGES = "RGB images, no touch"
 TIMM_NEEDS = ("patch_embed.proj.weight", "cls_token", "pos_embed", "blocks.0.attn.qkv.weight")
 _HF_NEEDS = ("embeddings.patch_embeddings.projection.weight", "embeddings.cls_token")
 _PARTS = r"(head|head_dist|fc_norm|pooler|classifier|decoder\w*)\..*|(decoder_pos_embed|mask_token)"

@@ -75,7 +75,7 @@ def camera() -> PressCamera:
 
 @pytest.fixture(scope="module")
 def address(touches, features, camera, tiny_run, tmp_path_factory) -> Iterator[str]:
-    """The page without anything named, of touches, features and a film in the place of a camera."""
+    """The page without anything named, of touches, features and a video instead of a camera."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(live_module, "open_source", lambda *_: (camera, True))
         out = tmp_path_factory.mktemp("taught") / "touches"
@@ -177,7 +177,7 @@ def test_a_surface_is_turned(browse):
     # still the first touch
     assert len(seen) == 4 and page.locator("input[type=number]").input_value() == "1"
     page.wait_for_selector("text=measured force, N")  # its curve
-    page.get_by_role("button", name="Picture").click()
+    page.get_by_role("button", name="Image").click()
     assert drawn(page) not in seen
 
 
@@ -288,11 +288,10 @@ def test_a_classifier_is_taught_by_touching(browse, camera):
 
 
 @pytest.mark.slow
-def test_ctrl_c_loses_no_recording(film, tiny_run, tmp_path):
+def test_ctrl_c_loses_no_recording(video, tiny_run, tmp_path):
     playwright = pytest.importorskip("playwright.sync_api")
-    words = (
-        f"view {film} --live --model {tiny_run} --sensor digit --out {tmp_path / 'out'} --port 8798"
-    )
+    words = f"view {video} --live --model {tiny_run} --sensor digit --port 8798"
+    words += f" --out {tmp_path / 'out'}"
     command = [sys.executable, "-m", "anytouch_jax", *words.split()]
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -349,7 +348,7 @@ def test_a_narrow_screen(browse):
 
 
 @pytest.mark.slow
-def test_on_a_phone_the_name_is_above_the_picture_and_the_button_at_the_bottom(browse, camera):
+def test_on_a_phone_the_name_is_above_the_image_and_the_button_at_the_bottom(browse, camera):
     page = browse(2, 390)
     camera.shape = "ball"
     until(page, f"{FRAMES} > 15")

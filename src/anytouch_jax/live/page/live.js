@@ -24,7 +24,7 @@ function verdict(result) {
 }
 
 function showLive(source, about) {
-  const canvas = el("canvas", { role: "img", ariaLabel: "live picture" }), curves = el("section", { className: "time" });
+  const canvas = el("canvas", { role: "img", ariaLabel: "live image" }), curves = el("section", { className: "time" });
   const felt = el("h2", { className: "felt" }), sure = el("div", { className: "bars small" }), why = el("p", { className: "soft" });
   const facts = el("div", { className: "facts" }), near = el("div", { className: "thumbs" }), nearest = el("div", { className: "thumbs" });
   const force = forceBar(), pictures = about.table === null ? null : framesOf(about.table, "frame", true);
@@ -169,7 +169,7 @@ function showLive(source, about) {
     fact("encoder p50, p99", `${one.encoder.map((value) => value.toFixed(1)).join(", ")} ms`);
     fact("frame to features", `${one.age.map((value) => value.toFixed(1)).join(", ")} ms`);
     fact("age on this page", `${percentile(ages, 0.5).toFixed(0)}, ${percentile(ages, 0.99).toFixed(0)} ms`, percentile(ages, 0.99) > 100 ? "bad" : "");
-    if (one.picture !== "ok" || one.missed) say(`The picture is ${one.picture}, ${one.missed} reads were missed.`, one.picture !== "ok");
+    if (one.picture !== "ok" || one.missed) say(`The image is ${one.picture}, ${one.missed} reads were missed.`, one.picture !== "ok");
     const hits = JSON.stringify([one.near, one.recorded].map((found) => found?.map((hit) => hit.row)));
     if (hits === shownNear) return;
     shownNear = hits;
@@ -209,7 +209,7 @@ function showLive(source, about) {
   });
 
   const layers = layerBar(about.layers, read);
-  const hidden = el("span", { className: "soft", hidden: true }, "The untouched gel is not known yet, so the picture is shown.");
+  const hidden = el("span", { className: "soft", hidden: true }, "The untouched gel is not known yet, so the image is shown.");
   const background = el("button", { onclick: () => send({ do: "background" }) }, "Capture the untouched gel");
   const feels = el("section", { className: "card feels", hidden: true }, felt, sure, why, nearest);
   // On a phone this bar stays at the bottom, under the thumb.

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from anytouch_jax.errors import UserError
-from anytouch_jax.live.cameras import CameraSettings, LoopedFilm, open_source
+from anytouch_jax.live.cameras import CameraSettings, LoopedVideo, open_source
 from anytouch_jax.live.examples import EXAMPLE, ExampleCamera
 from anytouch_jax.live.page.frames import FrameReader
 from anytouch_jax.live.page.naming import NearestTouches, name_touch
@@ -37,7 +37,7 @@ class Live:
     `start` begins, `stop` ends.
 
     Args:
-        source: what a user calls a camera, or a film.
+        source: what a user calls a camera, or a video.
         encoder: a loaded encoder.
         sensor: its name, None for the universal tokens.
         head: names live touch. One that is taught in the folder `out` replaces it.
@@ -102,7 +102,7 @@ class Live:
             source, live = open_source(self.source, self._camera, self._log)
             if not live and Path(self.source).is_file():
                 source.release()
-                source = LoopedFilm(Path(self.source))
+                source = LoopedVideo(Path(self.source))
         self._thread = threading.Thread(target=self._run, args=(source,), daemon=True)
         self._thread.start()
 
@@ -156,22 +156,22 @@ class Live:
         """Make the newest packet of an embedded frame."""
         kept = self.frames.last(frame.number)
         if not kept:
-            # The reader is so far ahead that the picture is gone.
+            # The reader is so far ahead that the image is gone.
             return
-        picture = kept[-1].turned
+        image = kept[-1].turned
         setup = kept[-1].setup
         score = self.frames.score(kept[-1])
         fields = None
         if score == score:  # NaN: the background is not known yet
             fields = self.frames.measured(kept, self._row)
-        self.recorder.add(picture, score, frame.values)
+        self.recorder.add(image, score, frame.values)
         self.teacher.look()
         self._times.append((frame.seconds[-1], frame.age))
         encoder, age = 1e3 * np.percentile(np.asarray(self._times), (50, 99), axis=0).T
         about: dict[str, Any] = {
             "frame": frame.number,
             "grabbed": 1e3 * (frame.started + frame.at),
-            "picture": frame.picture,
+            "picture": frame.image,
             "gel": "captured" if setup.running is None else "estimated",
             "encoder": encoder.round(2).tolist(),
             "age": age.round(2).tolist(),
@@ -183,4 +183,4 @@ class Live:
         about |= name_touch(self._head_in_use(), frame.values)
         spaces = {"near": self._space, "recorded": self.teacher.space}
         about |= self._nearest(frame.values, spaces)
-        self._newest = Shown(self._newest.number + 1, about, picture, setup.small, fields)
+        self._newest = Shown(self._newest.number + 1, about, image, setup.small, fields)

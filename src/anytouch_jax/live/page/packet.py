@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import cv2
 
-from anytouch_jax.data.background.estimate import UntouchedGel
+from anytouch_jax.data.background.estimate import UntouchedBackground
 from anytouch_jax.data.images import encode
 from anytouch_jax.encoder.arrays import Array
 from anytouch_jax.live.page.layers import (
@@ -33,15 +33,15 @@ class Shown(NamedTuple):
     Attributes:
         number: of the packet, from 1. 0 is nothing yet.
         about: what is known of the frame.
-        picture: RGB u8 (h, w, 3), turned.
+        image: RGB u8 (h, w, 3), turned.
         gel: the background, scaled down, and ready to be compared.
         fields: what was measured.
     """
 
     number: int = 0
     about: Mapping[str, Any] = {}
-    picture: Array | None = None
-    gel: tuple[Array, UntouchedGel] | None = None
+    image: Array | None = None
+    gel: tuple[Array, UntouchedBackground] | None = None
     fields: Fields | None = None
 
 
@@ -78,10 +78,10 @@ def packet(shown: Shown, layer: str) -> bytes:
     """Return a frame for the page: length u32, JSON, length u32, JPEG, little endian."""
     about = {"layer": layer, "sent": 1e3 * time.time(), **shown.about}
     jpeg = b""
-    if shown.picture is not None:
+    if shown.image is not None:
         # The score of a frame is known already: without a background none is computed again.
         gel = shown.gel if layer != LAYERS[0] else None
-        view, score = touch_layer(shown.picture, gel, about["threshold"], layer)
+        view, score = touch_layer(shown.image, gel, about["threshold"], layer)
         if score != score or (layer in MEASURED and shown.fields is None):
             about["layer"] = LAYERS[0]
         elif layer in MEASURED and shown.fields is not None:

@@ -1,4 +1,4 @@
-"""The server of the page: an ASGI application with JSON, pictures and the live stream.
+"""The server of the page: an ASGI application with JSON, images and the live stream.
 
 No address names a file. Other web sites cannot read or change anything. The name of the host is
 checked, there are no CORS headers, and every change needs a header that another site cannot send.
@@ -39,7 +39,7 @@ from anytouch_jax.live.examples import EXAMPLE
 from anytouch_jax.live.page.feature_map import FeatureMap
 from anytouch_jax.live.page.layers import LAYERS, SIDE, field_numbers, scale_down
 from anytouch_jax.live.page.runs import Run
-from anytouch_jax.live.page.tables import Table, open_examples, open_video_table, open_folder, title
+from anytouch_jax.live.page.tables import Table, open_examples, open_folder, open_video_table, title
 
 # Its libraries take seconds to import, and a manifest needs none of them.
 if TYPE_CHECKING:
@@ -85,9 +85,9 @@ class StartPage:
 
 
 def open_sources(paths: Sequence[Path]) -> list[Source]:
-    """Return what the page shows of each path: a manifest, a folder, a film, features or a run.
+    """Return what the page shows of each path: a manifest, a folder, a video, features or a run.
 
-    Features show the pictures of a table among the paths, or of the manifest in their folder that
+    Features show the images of a table among the paths, or of the manifest in their folder that
     they were made from. Raises UserError for anything else.
     """
     tables = list[Table]()
@@ -98,7 +98,7 @@ def open_sources(paths: Sequence[Path]) -> list[Source]:
             tables.append(open_examples())
         elif not path.exists():
             raise UserError(
-                f"There is no {path}. Name a manifest, a folder, a film, features, a run or a "
+                f"There is no {path}. Name a manifest, a folder, a video, features, a run or a "
                 "camera."
             )
         elif path.suffix.lower() == ".npz":
@@ -258,11 +258,11 @@ def _frame(request: Request, table: Table) -> Response:
     headers = {"X-Score": "" if np.isnan(score) else f"{score:.2f}"}
     if fields is not None:
         headers["X-Fields"] = json.dumps(field_numbers(fields))
-    return _picture(view, headers)
+    return _image(view, headers)
 
 
 def _photo(request: Request, table: Table) -> Response:
-    return _picture(table.photo(request.path_params["row"]))
+    return _image(table.photo(request.path_params["row"]))
 
 
 def _map(request: Request, space: FeatureMap) -> Response:
@@ -283,7 +283,7 @@ def _losses(request: Request, run: Run) -> Response:
 
 
 def _figure(request: Request, run: Run) -> Response:
-    return _picture(run.figure(request.path_params["name"]), side=4000)
+    return _image(run.figure(request.path_params["name"]), side=4000)
 
 
 def _stream(request: Request, live: Live) -> Response:
@@ -427,7 +427,7 @@ def _control(live: Live, order: Any) -> None:
     flip = order.get("flip")
     if action == "orient" and rotate in (0, 90, 180, 270) and flip in ("none", "across", "down"):
         if live.recorder.state()["on"]:
-            raise UserError("A recording is on. Stop it before you turn the picture.")
+            raise UserError("A recording is on. Stop it before you turn the image.")
         live.frames.orient(rotate, flip)
     elif action == "background":
         live.frames.capture_background()
@@ -471,7 +471,7 @@ def _json(value: Any, status: int = 200) -> Response:
     return JSONResponse(value, status, _SAFE | {"Cache-Control": "no-store"})
 
 
-def _picture(picture: Any, headers: dict[str, str] | None = None, *, side: int = SIDE) -> Response:
+def _image(image: Any, headers: dict[str, str] | None = None, *, side: int = SIDE) -> Response:
     headers = _SAFE | {"Cache-Control": "private, max-age=60"} | (headers or {})
-    data = encode(scale_down(picture, side), ".jpg", cv2.IMWRITE_JPEG_QUALITY, 90)
+    data = encode(scale_down(image, side), ".jpg", cv2.IMWRITE_JPEG_QUALITY, 90)
     return Response(data, media_type="image/jpeg", headers=headers)

@@ -143,7 +143,7 @@ class Teacher:
         self.reload()
 
     def archive(self) -> IO[bytes]:
-        """Return a ZIP of the manifest and its pictures, and of the head with its features."""
+        """Return a ZIP of the manifest and its images, and of the head with its features."""
         out = self._recorder.out
         files = {self._recorder.file, self.head_file, self._features}
         if self.table is not None:
@@ -223,7 +223,7 @@ class Teacher:
             )
             if len(found) < len(unknown):
                 raise UserError(
-                    f"{len(unknown) - len(found)} recorded frames have no picture of the untouched "
+                    f"{len(unknown) - len(found)} recorded frames have no image of the untouched "
                     "gel."
                 )
             known |= {paths[place]: one for place, one in zip(unknown, values, strict=True)}

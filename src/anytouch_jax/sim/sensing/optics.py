@@ -47,7 +47,7 @@ class PixelPositions(NamedTuple):
     v: Array  # (H,)
 
 
-class Camera(NamedTuple):
+class Rendering(NamedTuple):
     """How a unit is shown. It is equal in all frames of a clip."""
 
     sensor: Sensor
@@ -89,7 +89,7 @@ class _Channel(NamedTuple):
     uneven: Leaf  # (5,)
 
 
-def picture_size(sensor: Sensor, short: int = 224) -> tuple[int, int]:
+def image_size(sensor: Sensor, short: int = 224) -> tuple[int, int]:
     """Return (height, width) of an image of the whole field with square pixels.
 
     Its short side has `short` pixels. 0 is the sensor's resolution.
@@ -116,7 +116,9 @@ def pixel_positions(
     x = unit.window[0] + unit.mirror[0] * unit.zoom * wide * (jnp.arange(width) + 0.5 - width / 2)
     y = unit.window[1] + unit.mirror[1] * unit.zoom * tall * (jnp.arange(height) + 0.5 - height / 2)
     du, dv, su, sv = unit.lights
-    return PixelPositions(x, y, du + su * 2 * x / sensor.field[1], dv + sv * 2 * y / sensor.field[0])
+    return PixelPositions(
+        x, y, du + su * 2 * x / sensor.field[1], dv + sv * 2 * y / sensor.field[0]
+    )
 
 
 def backdrop(
@@ -130,7 +132,7 @@ def backdrop(
 
     Pass it to `render` as `behind` if many frames of one unit are rendered outside of one `vmap`.
     """
-    resolution = resolution or picture_size(sensor)
+    resolution = resolution or image_size(sensor)
     place = pixel_positions(sensor, unit, resolution, stretched=stretched)
     shape = unit.base.shape
     rows = interpolation.spline((place.v + 1) / 2 * shape[0] - 0.5, shape[0])[0]
@@ -160,7 +162,7 @@ def _light(uneven: Leaf, tint: Leaf, place: PixelPositions, sensor: Sensor) -> L
     return tint * relative * (1 - sensor.vignette * (u**2 + v**2) / 2)
 
 
-def render(  # noqa: PLR0913 - the call from before `Camera` and `Skin`
+def render(  # noqa: PLR0913 - the call from before `Rendering` and `Skin`
     displacement: Array | None,
     tangential: Array | None,
     pitch: float | Array,
@@ -174,19 +176,19 @@ def render(  # noqa: PLR0913 - the call from before `Camera` and `Skin`
     drift: Leaf | None = None,
     stretched: bool = False,
 ) -> Array:
-    """Render a skin as `show`, from the parts of its `Skin` and `Camera`.
+    """Render a skin as `show`, from the parts of its `Skin` and `Rendering`.
 
     A `displacement` of None is an untouched gel. `resolution` is by default square pixels with a
     short side of 224. Raises UserError for a sensor without a camera.
     """
-    camera = Camera(sensor, unit, resolution or picture_size(sensor), photometry, stretched)
+    camera = Rendering(sensor, unit, resolution or image_size(sensor), photometry, stretched)
     skin = None if displacement is None else Skin(displacement, tangential, pitch)
     return show(skin, camera, key, behind=behind, drift=drift)
 
 
 def show(
     skin: Skin | None,
-    camera: Camera,
+    camera: Rendering,
     key: Array | None = None,
     *,
     behind: Array | None = None,
@@ -362,7 +364,7 @@ def background(sensor: Sensor, unit: Unit, key: Array | None = None, **options: 
     return render(None, None, 1.0, sensor, unit, key, **options)
 
 
-def onto_picture(
+def onto_image(
     maps: Array,
     *,
     pitch: Any,
@@ -433,8 +435,10 @@ def _blurred(field: Array, sigma: Any) -> Array:
     return rows @ field @ columns.T
 
 
-def _ink(skin: Skin | None, place: PixelPositions, ink: Markers, sensor: Sensor, unit: Unit) -> Array:
-    """Return the share of ink (H, W): the lattice at the undeformed places of the skin.
+def _ink(
+    skin: Skin | None, place: PixelPositions, ink: Markers, sensor: Sensor, unit: Unit
+) -> Array:
+    """Return the fraction of ink (H, W): the lattice at the undeformed places of the skin.
 
     The skin at a pixel came from where it was before it moved, so the motion is subtracted.
     """
@@ -456,7 +460,7 @@ def _ink(skin: Skin | None, place: PixelPositions, ink: Markers, sensor: Sensor,
 def ink_coverage(
     markers: Markers, x: Array, y: Array, phase: Leaf, size: Leaf, soft: Array, half: Any
 ) -> Array:
-    """Return the share of ink, 0..1, at places of the skin.
+    """Return the fraction of ink, 0..1, at places of the skin.
 
     Spots lie on a lattice and differ a little in size, as printed spots do.
 
@@ -496,7 +500,7 @@ def is_traced(value: Any) -> bool:
 def _pixel_bits(key: Array, shape: tuple[int, int]) -> Array:
     """Return a random word u32 (H, W) for each pixel: its number, mixed with the key.
 
-    It is cheaper than `jax.random.bits`, and a picture's noise needs no cryptography.
+    It is cheaper than `jax.random.bits`, and an image's noise needs no cryptography.
     """
     step = jnp.uint32(0x9E3779B9)  # 2^32 over the golden ratio: odd, and far from small numbers
     first, second = _mixed(jax.random.key_data(key) + step)

@@ -1,4 +1,4 @@
-"""Pictures and surfaces of measured fields: depth in colour, an overlay, a mesh."""
+"""Images and surfaces of measured fields: depth in colour, an overlay, a mesh."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _ARROWS = 14  # along the shorter side
 _LONGER = 4  # times its length is how a shear is drawn
 _OPAQUE = np.float32(0.7)  # the most that the colours of depth cover a frame
 _ABOUT = (
-    "comment unit: mm (widths of the picture, if its width in mm is not known)\n"
+    "comment unit: mm (widths of the image, if its width in mm is not known)\n"
     "comment frame: right-handed, x right, y down, z away from the camera (REP 103)\n"
 )
 _GREEN = (120, 255, 120)
@@ -34,7 +34,7 @@ def depth_levels(depth: Array, width_mm: float | None) -> tuple[Array, float]:
 
 
 def overlay(frame: Array, measured: Fields, row: int = 0, *, text: bool = True) -> Array:
-    """Return a picture u8 (h, w, 3) of a frame with what was measured.
+    """Return an image u8 (h, w, 3) of a frame with what was measured.
 
     Depth is in colour, the rim of contact is white, arrows are shear that is longer than its
     deviation, and force and depth are written as `text`.

@@ -95,7 +95,7 @@ def simulated_pairs(batches: int, seed: int = 7) -> tuple[Images, Images]:
     """
     changes = {
         "data.batch_size": 16,
-        "data.clip_share": 0.0,
+        "data.clip_fraction": 0.0,
         "model.fields": 0,
         "model.text": None,
         "simulated.wild": 0.3,
@@ -225,6 +225,12 @@ def scatter_within(real: np.ndarray, touches: RealTouches, pairs: np.ndarray) ->
     return total * len(total) / np.trace(total)
 
 
+def whitening(within: np.ndarray) -> np.ndarray:
+    """Return the symmetric map (d, d) that makes a scatter (d, d) the same in all directions."""
+    values, vectors = np.linalg.eigh(within + SHRINKAGE * np.eye(len(within)))
+    return np.asarray(vectors / np.sqrt(values) @ vectors.T)
+
+
 def readout(trunk: Params, touches: RealTouches, pairs: Images) -> Params:
     """Return the kernel and the bias of `nn.sight.Sight.read`.
 
@@ -239,8 +245,7 @@ def readout(trunk: Params, touches: RealTouches, pairs: Images) -> Params:
     real = (real - mean) / deviation
     simulated = (means_of(trunk, pairs.reshape(-1, SIDE, SIDE, 3)) - mean) / deviation
     within = scatter_within(real, touches, simulated.reshape(len(pairs), 2, -1))
-    values, vectors = np.linalg.eigh(within + SHRINKAGE * np.eye(len(within)))
-    kernel = vectors / np.sqrt(values) @ vectors.T
+    kernel = whitening(within)
     kernel = kernel * (DEVIATION / (real[is_contact] @ kernel).std(0)) / deviation[:, None]
     return {"kernel": kernel.astype(np.float32), "bias": (-mean @ kernel).astype(np.float32)}
 

@@ -43,7 +43,7 @@ BLOCKS = (
     Form(5, 1, 672, 112),
     Form(5, 1, 672, 112),
 )
-READ = (0, 1, 2, 4, 7, 10)  # blocks whose means over the image are features
+READ = (2, 4, 7, 10)  # blocks whose means over the image are features
 MEANS = sum(BLOCKS[number].outputs for number in READ)
 # Pixels are read as (pixel - MIDDLE) / RANGE, as by EfficientNet-lite. The zeros around an image
 # are then the grey of an untouched gel, where the background is subtracted.

@@ -8,6 +8,7 @@ from tiny_models import tiny_config
 
 from anytouch_jax.encoder.encoder import random_encoder
 from anytouch_jax.encoder.linear_head import load_head
+from anytouch_jax.live.page.longer import LongerTraining
 from anytouch_jax.live.page.teach import LiveRecorder, Teacher
 
 RECORDINGS = 16
@@ -90,3 +91,20 @@ def test_pages_on_two_sensors_have_a_head_each_in_one_folder(encoder, tmp_path):
         np.testing.assert_array_equal(again.head.weights, head.weights)
         file = again.about()["file"]
         np.testing.assert_array_equal(load_head(file).weights, head.weights)
+
+
+def test_what_was_trained_longer_is_of_one_sensor(tmp_path):
+    """A page finds its own folder, and that of another sensor is not replaced."""
+    folder = tmp_path / "touches"
+    shown = {}
+    for sensor in ("digit", "gelsight", "digit"):
+        recorder = LiveRecorder(folder, sensor)
+        shown[sensor] = LongerTraining(None, recorder, print).about()["folder"]
+        tuned = folder / "tuned"
+        if not tuned.is_dir():
+            tuned.mkdir(parents=True)
+            (tuned / "sensor.txt").write_text(sensor)
+    assert shown == {
+        "digit": str(folder / "tuned"),
+        "gelsight": str(folder / "tuned_gelsight"),
+    }

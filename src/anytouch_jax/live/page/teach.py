@@ -8,7 +8,6 @@ import time
 import zipfile
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from tempfile import TemporaryFile
 from typing import IO, TYPE_CHECKING, Any
 
@@ -18,7 +17,6 @@ from anytouch_jax.encoder.arrays import Array, Pooling
 from anytouch_jax.encoder.embed import Features, embed_rows, save_npz
 from anytouch_jax.encoder.linear_head import load_head, save_head
 from anytouch_jax.errors import UserError
-from anytouch_jax.files import read_arrays
 from anytouch_jax.live.page.accuracy import RESULT, measure_head
 from anytouch_jax.live.page.feature_map import FeatureMap
 from anytouch_jax.live.page.fitting import fit_head
@@ -33,15 +31,6 @@ if TYPE_CHECKING:
 
 _LOOK = 1.0  # seconds between looks for the recordings of other pages
 _BATCH = 4  # frames embedded at once: live touch waits for them
-
-
-def _sensors_of(features: Path) -> set[str]:
-    """Return the sensors of a features file, none for one that is missing or damaged."""
-    try:
-        arrays = read_arrays(features, only="key/sensor".__eq__)
-    except (OSError, ValueError):
-        return set()
-    return set(arrays["key/sensor"].tolist()) if "key/sensor" in arrays else set()
 
 
 class Teacher:
@@ -61,7 +50,7 @@ class Teacher:
         self._recorder = recorder
         self._pooling = pooling
         self._log = log
-        self._choose_files()
+        self.head_file, self._features = recorder.head_files()
         self.head: Head | None = None
         self.space: FeatureMap | None = None
         self.table: Table | None = None
@@ -82,19 +71,6 @@ class Teacher:
             except UserError as error:
                 log(f"The head in {recorder.out} is not used. {error}")
         self.longer.reopen(self.head_file)
-
-    def _choose_files(self) -> None:
-        """Name the files of the head: head.npz, or head_SENSOR.npz beside that of another sensor.
-
-        Two pages on different sensors may share the folder, and each has a head of its own.
-        """
-        out = self._recorder.out
-        self.head_file = out / "head.npz"
-        self._features = out / "features.npz"
-        sensor = self._recorder.sensor
-        if _sensors_of(self._features) - {sensor}:
-            self.head_file = out / f"head_{sensor}.npz"
-            self._features = out / f"features_{sensor}.npz"
 
     def reload(self) -> None:
         """Read the manifest again, after a recording. Raises UserError."""
@@ -242,7 +218,8 @@ class Teacher:
         }
         # The two files belong together: another page must not write one of them between.
         with self._recorder.manifest.locked():
-            self._choose_files()  # another page may have been the first to train
+            # Again, because another page may have been the first to train.
+            self.head_file, self._features = self._recorder.head_files()
             save_npz(self._features, features, about)
             save_head(self.head_file, fitted.head)
         self._use(fitted.head)

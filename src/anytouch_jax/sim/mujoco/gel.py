@@ -57,7 +57,7 @@ class GelView:
     @property
     def image(self) -> tuple[int, int]:
         """(height, width) of the picture."""
-        return optics.picture_size(self.sensor, self.size)
+        return optics.image_size(self.sensor, self.size)
 
     @property
     def gel(self) -> Gel:
@@ -128,7 +128,7 @@ def device_of(view: GelView, unit: Unit) -> GelDevice:
 
 def show_untouched(device: GelDevice, key: Array, view: GelView) -> Array:
     """Return the picture u8 (H, W, 3) of a gel that nothing touches, with its noise."""
-    picture = optics.Picture(view.sensor, device.unit, view.image)
+    picture = optics.Rendering(view.sensor, device.unit, view.image)
     return optics.show(None, picture, key, behind=device.behind)
 
 
@@ -171,12 +171,12 @@ def feel(
     change = squeezed - state.squeezed
     sheared = _sheared(state, press, contact, change, device.unit, view)
     moved = sheared.displacement + squeezed
-    picture = optics.Picture(view.sensor, device.unit, view.image)
+    picture = optics.Rendering(view.sensor, device.unit, view.image)
     skin = optics.Skin(press.displacement, moved, pitch)
     mirror = jnp.asarray(device.unit.mirror)
     force = jnp.stack([*(sheared.force * mirror), press.force])
     onto = partial(
-        optics.onto_picture,
+        optics.onto_image,
         pitch=pitch,
         sensor=view.sensor,
         unit=device.unit,
@@ -379,7 +379,7 @@ def _stiffness(press: PressResult, gel: Gel, pitch: float) -> Array:
     touching = jnp.maximum(mechanics.area(press.pressure, pitch), pitch**2)
     modulus = gel.modulus / (2 * (1 + gel.poisson))
     circle = 8 * modulus * jnp.sqrt(touching / jnp.pi) / (2 - gel.poisson)
-    return (circle + modulus * touching / gel.thickness) * KPA_MM2
+    return jnp.asarray((circle + modulus * touching / gel.thickness) * KPA_MM2)
 
 
 def _coarse(view: GelView) -> tuple[int, int]:

@@ -100,6 +100,9 @@ class Pads:
 
     def _check(self, data: mujoco.MjData) -> None:
         """Raise UserError for a scene with NaN, also if MuJoCo has reset it meanwhile."""
+        sizes = (len(data.qpos), len(data.geom_xpos), len(data.site_xpos))
+        if sizes != (self._model.nq, self._model.ngeom, self._model.nsite):
+            raise UserError("these data are of another model than the touch sensor")
         if not (np.isfinite(data.qpos).all() and np.isfinite(data.qvel).all()):
             raise UserError(
                 f"the scene has NaN in its state at {data.time:g} s, so what the pads feel is "

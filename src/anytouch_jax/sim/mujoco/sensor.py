@@ -119,7 +119,6 @@ class TouchSensor:
         self.device = _device(self.view)(self._unit)
         self._states: list[GelState | None] = [None] * len(self._sites)
         self._count = 0
-        self._plain: np.ndarray | None = None
         # The noise of the background is that of one picture that was taken before.
         before = np.full(2, 2**32 - 1, np.uint32)
         self.background = np.asarray(_untouched(self.view)(self.device, before))
@@ -160,7 +159,8 @@ class TouchSensor:
             The reading. Several scenes and several pads each add a leading axis, in this order.
 
         Raises:
-            UserError: For NaN in a scene, an object deep inside a pad at the start, and a flex.
+            UserError: For NaN in a scene, an object deep inside a pad at the start, a flex, and
+                the data of another model.
         """
         batched = not isinstance(data, mujoco.MjData)
         scenes: list[Any] = list(data) if batched else [data]
@@ -189,7 +189,9 @@ class TouchSensor:
         )
 
     def _meet(self, scenes: list[mujoco.MjData]) -> list[Met | None]:
-        """Return what each pad of each scene meets."""
+        """Return what each pad of each scene meets. Raises UserError for no scene."""
+        if not scenes:
+            raise UserError("there is no scene to read; give at least one MjData")
         while len(self._scenes) < len(scenes):
             self._scenes.append(Pads(self._model, self._sites, self.view, self._unit))
         if len(self._states) != len(scenes) * len(self._sites):

@@ -20,6 +20,7 @@ _HOMES = {
     "train.optim": "optimizer",
     "train.loop": "fit",
     "training": "pretrain",
+    "finetuning": "FinetuneOptions finetune",
     "sim.recorder": "simulate_touch",
     "evaluate.heads": "ProbeHead",
     "evaluate.probing": "leave_groups_out probe_benchmark probe_features probe_label probe_tasks",

@@ -260,7 +260,8 @@ def _query(
                 f"A sentence is compared with features of pooling class, not {pooling}. Embed "
                 "again."
             )
-        return encoder.encode_text(query)
+        # A sentence says nothing of what a convolutional trunk adds to the features.
+        return np.pad(encoder.encode_text(query), ((0, 0), (0, encoder.config.model.sight)))
     length = 1
     if about.get("frames", "1").isdecimal():
         length = int(about.get("frames", "1"))

@@ -63,6 +63,8 @@ function showLive(source, about) {
   const lifted = (event) => { if (event.key === "r") release(); };
   const leave = () => { if (pressed) send({ do: "stop" }, { keepalive: true }); };
   const names = el("ul", { className: "names" }), train = el("button", { onclick: () => send({ do: "train" }) }, "Train");
+  const longer = el("button", { onclick: () => send({ do: longer.dataset.on ? "keep the best" : "train longer" }), hidden: true }, "Train longer");
+  const course = el("p", { className: "soft", role: "status" });
   const missing = el("p", { className: "soft", role: "status" }), result = el("div", { className: "column" });
   const save = (file) => guard(async () => {
     const address = URL.createObjectURL(await (await api(`${source}/taught/${file}`)).blob());
@@ -85,11 +87,21 @@ function showLive(source, about) {
     train.disabled = found.training || Boolean(found.missing);
     train.className = several.length > 1 && !found.trained ? "main" : "";
     train.textContent = found.training ? (found.trained && found.result.right === undefined ? "Measuring …" : "Training …") : found.trained ? "Train again" : "Train";
+    const more = found.longer, clock = (left) => `${Math.floor(left / 60)}:${String(Math.floor(left % 60)).padStart(2, "0")}`;
+    trained ||= more.used;
+    longer.hidden = !found.trained && !more.on;
+    longer.dataset.on = more.on ? "on" : "";
+    longer.textContent = more.on ? "Stop and keep the best" : "Train longer";
+    longer.title = "Trains the encoder too, on all recordings. Some are held out, and it never ends below the head.";
+    train.disabled ||= more.on;
+    course.className = more.fault ? "alarm" : "soft";
+    course.textContent = more.on ? `Training the encoder: ${clock(more.left)} left${more.score ? `. On held-out recordings: ${more.score}, the head alone: ${more.before}.` : ""}` : more.fault || more.said;
     missing.className = found.fault ? "alarm" : "soft";
     missing.textContent = found.fault || (several.length ? found.missing : "Type a name, hold the button, and touch. Touch it again for a second recording. Then teach another name.");
     downloads.hidden = !several.length;
     downloads.firstChild.disabled = !found.trained;
-    const use = `anytouch stream --data ${/^\d+$/.test(about.source) ? about.source : "0"} ${about.sensor ? `--sensor ${about.sensor} ` : ""}--head ${found.file} --out -`;
+    const by = more.used ? `--model ${more.folder}` : `--head ${found.file}`;
+    const use = `anytouch stream --data ${/^\d+$/.test(about.source) ? about.source : "0"} ${about.sensor ? `--sensor ${about.sensor} ` : ""}${by} --out -`;
     result.replaceChildren(...(found.trained ? [...verdict(found.result), el("p", { className: "soft small" }, "Use it in a robot:"), el("code", {}, use)] : []));
   });
 
@@ -118,7 +130,7 @@ function showLive(source, about) {
     feels.hidden = !known && one.contact === null;
     const named = known && one.contact !== false && one.label !== undefined;
     feels.classList.toggle("novel", Boolean(named && one.novel));
-    sure.hidden = !named || one.novel;
+    sure.hidden = !named || one.novel || one.p === undefined;
     nearest.hidden = !named;
     why.textContent = "";
     if (!known && one.contact === null) { felt.textContent = ""; return; }
@@ -222,7 +234,7 @@ function showLive(source, about) {
   const feels = el("section", { className: "card feels", hidden: true }, felt, sure, why, nearest);
   // On a phone this bar stays at the bottom, under the thumb.
   const recordBar = el("div", { className: "recordbar" }, el("label", { className: "tall" }, "name of what you touch", object), record);
-  const teach = el("section", { className: "card teach" }, el("h3", {}, "Teach it a touch"), known, recordBar, names, missing, train, result, downloads);
+  const teach = el("section", { className: "card teach" }, el("h3", {}, "Teach it a touch"), known, recordBar, names, missing, el("div", { className: "bar" }, train, longer), course, result, downloads);
   const more = el("details", {}, el("summary", {}, "Camera and latency"), el("div", { className: "column" }, el("div", { className: "bar" },
     option("rotate", [0, 90, 180, 270].map((angle) => [angle, `${angle}°`]), 0, (value) => { view.rotate = value; turn(); }),
     option("flip", [["none", "none"], ["across", "left-right"], ["down", "top-bottom"]], "none", (value) => { view.flip = value; turn(); }),

@@ -25,7 +25,7 @@ from anytouch_jax.live.stream import Embedded, Source, StreamSettings, stream_wi
 
 if TYPE_CHECKING:
     from anytouch_jax.encoder.encoder import Encoder
-    from anytouch_jax.encoder.linear_head import LinearHead
+    from anytouch_jax.encoder.linear_head import Head
     from anytouch_jax.live.page.feature_map import FeatureMap
 
 _KEPT = 600  # frames whose times make p50 and p99, as on the page
@@ -56,7 +56,7 @@ class Live:
         encoder: Encoder,
         *,
         sensor: str | None,
-        head: LinearHead | None = None,
+        head: Head | None = None,
         space: FeatureMap | None = None,
         out: Path,
         camera: CameraSettings | None = None,
@@ -110,12 +110,20 @@ class Live:
     def stop(self) -> None:
         """End the stream, and the recording."""
         self._stopped = True
+        self.teacher.longer.stop()
         self.recorder.stop()
         if self._thread is not None:
             self._thread.join(3)
 
-    def _head_in_use(self) -> LinearHead | None:
+    def _head_in_use(self) -> Head | None:
         return self.teacher.head or self._head
+
+    def _named(self, frame: Embedded, prepared: np.ndarray) -> dict[str, Any]:
+        """Return the name of a frame, by the encoder that was trained longer if there is one."""
+        tuned = self.teacher.longer.tuned
+        if tuned is None:
+            return name_touch(self._head_in_use(), frame.values)
+        return name_touch(tuned.head, tuned.features(prepared, self._row))
 
     async def packets(self, layer: str, side: int = SIDE) -> AsyncIterator[bytes]:
         """Yield each newest frame as a layer, with a long side of `side` pixels (see `packet`).
@@ -181,7 +189,7 @@ class Live:
             "taught": self.teacher.version,
         }
         about |= describe_touch(score, self.frames.threshold, fields)
-        about |= name_touch(self._head_in_use(), frame.values)
+        about |= self._named(frame, kept[-1].prepared)
         spaces = {"near": self._space, "recorded": self.teacher.space}
         about |= self._nearest(frame.values, spaces)
         self._newest = Shown(self._newest.number + 1, about, image, setup.small, fields)

@@ -450,6 +450,10 @@ def _control(live: Live, order: Any) -> None:
         live.teacher.reload()
     elif action == "train":
         live.teacher.train()
+    elif action == "train longer":
+        live.teacher.train_longer()
+    elif action == "keep the best":
+        live.teacher.longer.stop()
     elif action == "leave out" and isinstance(sequence, str):
         live.teacher.leave_out(sequence)
     else:

@@ -131,8 +131,8 @@ def main() -> None:
     options = parser.parse_args()
     enable_compilation_cache()
     config = configure(options.steps, options.masked, residual=not options.whole)
-    name = f"{'whole' if options.whole else 'residual'}, {options.masked:.0%} masked"
-    run = options.folder / name.replace(", ", "-").replace(" ", "-").replace("%", "")
+    name = f"{'whole' if options.whole else 'residual'}, {100 * options.masked:.0f} % masked"
+    run = options.folder / name.replace(", ", "-").replace(" % ", "-").replace(" ", "-")
     result = pretrain(config, run, init="anytouch-tiny", stop_after=options.stop_after, log=log)
     loaded = load_model(run)
     own, copied, objects = errors(loaded.params, config)

@@ -119,7 +119,8 @@ def sentences(found: Findings) -> list[str]:
     head = found.package.points[0].named
     not_learned = (
         f"Not learned: of the {len(rights)} shapes in the test it knows the {worst} least, "
-        f"{rights[worst]}, where chance is {100 / len(NAMES):.0f} %. Most of what it knows came with the package: "
+        f"{rights[worst]}, where chance is {100 / len(NAMES):.0f} %. Most of what it knows came "
+        "with the package: "
         f"{HEAD}, names {scores[HEAD]}, and training the whole encoder adds "
         f"{gain_of(end, head, test)}."
     )

@@ -6,7 +6,7 @@ from anytouch_jax.config import from_json, to_json
 from anytouch_jax.nn.functional import build
 from anytouch_jax.sim.batches import SIMULATED
 from anytouch_jax.weights.tree import flatten
-from experiments.encoders import lookalikes, motion
+from experiments.encoders import lookalikes, motion, trunk
 from experiments.encoders.train import configure
 from experiments.pages.encoders import lookalikes as page
 from experiments.records import write_record
@@ -73,3 +73,25 @@ def test_a_perfect_encoder_finds_every_touch_and_noise_finds_chance(tmp_path, mo
     assert made.findings == [
         f"fine alignment: `a` finds 100 %, and pixels {100 * scores['pixels']:.0f} %."
     ]
+
+
+def test_the_readout_takes_out_what_units_differ_by() -> None:
+    rng = np.random.default_rng(0)
+    names = np.repeat([f"touch {number}" for number in range(40)], 2)
+    own = np.repeat(rng.standard_normal((40, 6)), 2, axis=0)
+    unit = np.tile(["cam0", "cam2"], 40)
+    # The first two features tell the unit, and little of the touch.
+    features = own + np.where(unit == "cam0", 3.0, -3.0)[:, None] * np.array([1, -1, 0, 0, 0, 0])
+    images = np.zeros((80, 1, 1, 3), np.uint8)
+    pairs = rng.standard_normal((30, 1, 6)) + rng.normal(0, 0.1, (30, 2, 6))
+    touches = trunk.RealTouches(images, names, unit)
+    kernel = trunk.whitening(trunk.scatter_within(features, touches, pairs))
+    assert np.allclose(kernel, kernel.T)
+
+    def apart(values: np.ndarray) -> float:
+        between = values[unit == "cam0"].mean(0) - values[unit == "cam2"].mean(0)
+        return float(np.linalg.norm(between) / values.std())
+
+    assert apart(features @ kernel) < 0.6 * apart(features)
+    # Where no unit differs, nothing is preferred.
+    assert np.allclose(trunk.whitening(np.eye(6)), trunk.whitening(np.eye(6))[0, 0] * np.eye(6))

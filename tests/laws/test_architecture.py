@@ -107,6 +107,8 @@ ONLY_IN: dict[str, set[str]] = {
     "pickle": {"zoo.torch_file", "datasets.readers.common"},
     "starlette": {"live.page"},
     "uvicorn": {"live.page"},
+    "mujoco": {"sim.mujoco"},
+    "gymnasium": {"sim.mujoco"},
     "importlib": {"__init__", "doors", "errors", "renamed"},
 }
 WITHOUT_JAX = {"data", "config", "batch", "datasets"} | GROUND

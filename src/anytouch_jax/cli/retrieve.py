@@ -260,7 +260,8 @@ def _query(
                 f"A sentence is compared with features of pooling class, not {pooling}. Embed "
                 "again."
             )
-        return encoder.encode_text(query)
+        # A sentence says nothing of what a convolutional trunk adds to the features.
+        return np.pad(encoder.encode_text(query), ((0, 0), (0, encoder.config.model.sight)))
     length = 1
     if about.get("frames", "1").isdecimal():
         length = int(about.get("frames", "1"))
@@ -327,12 +328,12 @@ def _cells(score: Retrieval) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class ReportOptions:
-    """Report on a stage-1 and a stage-2 run: samples, losses, retrieval, probes.
+    """Report what a stage-1 and a stage-2 run have learned, beside guesses.
 
     Example: anytouch report --data data/scenes/manifest.parquet --stage1 runs/stage1 --stage2
     runs/stage2 --out report
 
-    The report has reconstructions and a t-SNE, too.
+    It begins with three sentences, and has retrieval, probes, hidden patches and losses.
     """
 
     data: Path  # Manifest of simulated scenes, or one with the same columns.

@@ -119,6 +119,8 @@ class ModelConfig:
     # Give the decoder the sensor tokens before encoding (release).
     decoder_sensor_tokens: bool = False
     patch_encoder: Literal["shared", "sensor"] = "shared"  # One, or one a sensor (T3).
+    # Values of the convolutional trunk that join the features of touch. 0: no trunk.
+    sight: Number = 0
     fields: Number = 0  # Channels of the decoder of depth, shear, contact and force. 0: none.
     # linear is the release, cosine is ours.
     match_head: Literal["mlp", "linear", "cosine", "none"] = "none"

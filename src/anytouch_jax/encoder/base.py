@@ -103,7 +103,7 @@ class Encoder(Towers):
                 f"{model.frames} or more"
             ),
             "background": background,
-            "features": str(model.embed),
+            "features": str(model.embed + model.sight),
             "sensors": sensors,
         }
 

@@ -82,11 +82,14 @@ def touch_features(
     check_choices(pooling, aggregation)
     clips = normalise_touch(clips)
     if pooling == "class":
-        return net.encode_touch(params, clips, sensor, aggregation).astype(jnp.float32)
-    # XLA drops the class token where it is not used, so "mean" does not cost more than it needs.
-    both = net.encode_poolings(params, clips, sensor, aggregation)
-    used = both if pooling == "both" else both[1:]
-    return jnp.concatenate(used, axis=-1).astype(jnp.float32)
+        values = [net.encode_touch(params, clips, sensor, aggregation)]
+    else:
+        # XLA drops the class token where it is not used, so "mean" costs no more than it needs.
+        both = net.encode_poolings(params, clips, sensor, aggregation)
+        values = [*(both if pooling == "both" else both[1:])]
+    if net.model.sight:
+        values.append(net.encode_sight(params, clips, sensor, aggregation))
+    return jnp.concatenate(values, axis=-1).astype(jnp.float32)
 
 
 def features_and_fields(
@@ -109,8 +112,11 @@ def features_and_fields(
         pooling: that of the features.
     """
     check_choices(pooling, "mean")
-    token, mean, out = net.encode_and_measure(params, normalise_touch(clips), sensor, aspect)
-    values = {"class": (token,), "mean": (mean,), "both": (token, mean)}[pooling]
+    clips = normalise_touch(clips)
+    token, mean, out = net.encode_and_measure(params, clips, sensor, aspect)
+    values = {"class": [token], "mean": [mean], "both": [token, mean]}[pooling]
+    if net.model.sight:
+        values.append(net.encode_sight(params, clips, sensor))
     wide = jax.tree.map(lambda value: value.astype(jnp.float32), out)
     return jnp.concatenate(values, axis=-1).astype(jnp.float32), wide
 

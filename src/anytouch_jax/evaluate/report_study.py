@@ -57,7 +57,9 @@ def study_of(
         values = embed_rows(encoder, table, rows, pooling="both", backgrounds=backgrounds, log=log)[
             1
         ]
-        classes[name], patches[name] = np.split(values, [encoder.config.model.embed], axis=1)
+        width = encoder.config.model.embed
+        # What a trunk adds, `nn.sight`, follows both.
+        classes[name], patches[name], _ = np.split(values, [width, 2 * width], axis=1)
     pixels, notes = baseline(PIXELS, lambda: background_difference(table, rows, backgrounds))
     return Study(
         table, rows, table.text_column("split")[rows], classes, patches, pixels, tuple(notes)

@@ -79,6 +79,14 @@ class AnyTouch(nnx.Module):
 
         return self._over_segments(both, clip, sensor, aggregation)
 
+    def encode_sight(self, clip: Array, sensor: Array, aggregation: str = "mean") -> Array:
+        """Return what the trunk gives of the last frame of each segment, see `Net.encode_sight`."""
+
+        def last(clip: Array, _: Array) -> Array:
+            return self.touch.sight(clip[:, -1])
+
+        return self._over_segments(last, clip, sensor, aggregation)
+
     def _poolings(self, hidden: Array) -> tuple[Array, Array]:
         """Return both poolings (B, E) of the last hidden states (B, 1 + S + N, D)."""
         mean = jnp.mean(self.touch.projection(hidden[:, self.decoder.special :]), axis=1)

@@ -91,6 +91,15 @@ class Net:
         """Return both poolings (B, E) in one pass: class token, and mean over patch tokens."""
         return self.bind(params).encode_poolings(clip, sensor, aggregation)
 
+    def encode_sight(
+        self, params: Params, clip: Array, sensor: Array, aggregation: str = "mean"
+    ) -> Array:
+        """Return values (B, model.sight) of the last frame of normalised clips, see `nn.sight`.
+
+        Those of a clip (B, T, H, W, 3) of several segments are aggregated as in `encode_touch`.
+        """
+        return self.bind(params).encode_sight(clip, sensor, aggregation)
+
     def encode_tokens(
         self, params: Params, clip: Array, sensor: Array, keep_ids: Array | None = None
     ) -> Array:

@@ -208,7 +208,7 @@ def write_encoder(
         },
         "image_size": model.image_size,
         "frames": model.frames,
-        "features": model.embed,
+        "features": model.embed + model.sight,
         "background": loaded.config.data.background,
         "trained_sensors": loaded.trained_sensors,
         "stage": loaded.config.stage,

@@ -2,6 +2,7 @@
 // Live touch, and a classifier that is taught by touching.
 
 const KEPT_LIVE = 300, HELD = 400; // points of a live curve, ms from which a pressed button was held
+const CURVES = 100, WORDS = 300; // ms between drawings of the curves, and between changes of words, which people read
 
 const percent = (share) => `${Math.round(100 * share)} %`;
 
@@ -29,7 +30,7 @@ function showLive(source, about) {
   const facts = el("div", { className: "facts" }), near = el("div", { className: "thumbs" }), nearest = el("div", { className: "thumbs" });
   const force = forceBar(), pictures = about.table === null ? null : framesOf(about.table, "frame", true);
   const ages = [], scores = {}, boxes = {}, view = { rotate: 0, flip: "none" };
-  let stopped = new AbortController(), shownNear = "", done = null, recording = false, pressed = 0, taught = -1, trained = false, orders = Promise.resolve();
+  let drawnAt = 0, toldAt = 0, stopped = new AbortController(), shownNear = "", done = null, recording = false, pressed = 0, taught = -1, trained = false, orders = Promise.resolve();
   let recorded = new Pictures(`${source}/recorded`, "frame", true);
   const fact = (name, value, kind = "") => {
     boxes[name] ??= facts.appendChild(el("div", { className: "fact" }, name, el("b")));
@@ -156,7 +157,7 @@ function showLive(source, about) {
   const show = async (one, jpeg) => {
     if (one.error) { say(one.error, true); return; }
     const bitmap = await createImageBitmap(new Blob([jpeg], { type: "image/jpeg" }));
-    showLayer(canvas, bitmap, one.layer === "surface");
+    showLayer(canvas, bitmap, one.layer === "surface" ? one.fields : null);
     bitmap.close();
     const age = performance.timeOrigin + performance.now() - one.grabbed;
     ages.push(age);
@@ -165,9 +166,14 @@ function showLive(source, about) {
     main.dataset.frames = Number(main.dataset.frames ?? 0) + 1;
     if (one.taught !== taught) { taught = one.taught; learn(); }
     recording = one.recording.on;
-    if (one.frame % 10 && ages.length > 10) return; // text ten times as slow as pictures can be read
+    const now = performance.now();
+    if (now - drawnAt > CURVES) {
+      drawnAt = now;
+      draws.forEach((draw) => draw());
+    }
+    if (now - toldAt < WORDS) return;
+    toldAt = now;
     main.dataset.ages = JSON.stringify([percentile(ages, 0.5), percentile(ages, 0.99), Math.max(...ages)].map(Math.round));
-    draws.forEach((draw) => draw());
     feel(one);
     force.show(one.fields, one.layer);
     hidden.hidden = one.layer === state.layer;
@@ -194,7 +200,9 @@ function showLive(source, about) {
   const read = guard(async () => {
     stopped.abort();
     stopped = new AbortController();
-    const reader = (await api(`${source}/stream?layer=${state.layer}`, { signal: stopped.signal })).body.getReader();
+    // A picture has no more pixels than are shown: the browser decodes each of them.
+    const side = Math.round((window.devicePixelRatio || 1) * Math.max(canvas.clientWidth, canvas.clientHeight)) || 640;
+    const reader = (await api(`${source}/stream?layer=${state.layer}&side=${side}`, { signal: stopped.signal })).body.getReader();
     let data = new Uint8Array(0), newest = null, drawing = false;
     const draw = guard(async () => { // while one is decoded, others arrive: only the newest is drawn next
       drawing = true;

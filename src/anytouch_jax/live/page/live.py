@@ -16,6 +16,7 @@ from anytouch_jax.errors import UserError
 from anytouch_jax.live.cameras import CameraSettings, LoopedVideo, open_source
 from anytouch_jax.live.examples import EXAMPLE, ExampleCamera
 from anytouch_jax.live.page.frames import FrameReader
+from anytouch_jax.live.page.layers import SIDE
 from anytouch_jax.live.page.naming import NearestTouches, name_touch
 from anytouch_jax.live.page.packet import Shown, describe_touch, layers_of, packet
 from anytouch_jax.live.page.recorder import LiveRecorder
@@ -124,8 +125,8 @@ class Live:
             return name_touch(self._head_in_use(), frame.values)
         return name_touch(tuned.head, tuned.features(prepared, self._row))
 
-    async def packets(self, layer: str) -> AsyncIterator[bytes]:
-        """Yield each newest frame as a layer (see `packet`).
+    async def packets(self, layer: str, side: int = SIDE) -> AsyncIterator[bytes]:
+        """Yield each newest frame as a layer, with a long side of `side` pixels (see `packet`).
 
         Between frames it takes no thread: the server has 40, and a page that is left open keeps its
         stream.
@@ -137,7 +138,7 @@ class Live:
                 await asyncio.sleep(_LOOK)
             else:
                 seen = newest.number
-                yield await asyncio.to_thread(packet, newest, layer)
+                yield await asyncio.to_thread(packet, newest, layer, side)
 
     def _run(self, source: Any) -> None:
         """Show what a source gives, up to its end: the camera's thread."""

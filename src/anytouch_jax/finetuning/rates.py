@@ -15,7 +15,7 @@ from anytouch_jax.finetuning.options import Recipe
 HEAD = "head"  # name of the head among the parameters
 
 
-def rate_of(
+def depth_factor(
     name: str, shape: tuple[int, ...], recipe: Recipe, model: ModelConfig, depths: dict[str, int]
 ) -> jax.Array | float:
     """Return the factor on the learning rate of a parameter.

@@ -88,6 +88,14 @@ STAGE2 = (
 
 def small(words: list[str]) -> list[str]:
     """Return the words of a command, with sizes that compile fast if it trains."""
+    if words[0] == "finetune":
+        # Time for the linear head and a few steps.
+        return [
+            *words[: words.index("--minutes")],
+            "--minutes",
+            "0.3",
+            *words[words.index("--minutes") + 2 :],
+        ]
     if words[0] != "train" or "runs/try" in words:  # that one is typed word for word
         return words
     stage = STAGE2 if words[words.index("--stage") + 1] == "2" else STAGE1

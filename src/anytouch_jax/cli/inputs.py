@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from anytouch_jax.cli.arguments import DEFAULT
+from anytouch_jax.cli.heads import head_in_use
 from anytouch_jax.cli.output import log, refuse_join, refuse_unused
 from anytouch_jax.config import FIELD_SENSORS, UNIVERSAL, check_spelling
 from anytouch_jax.config.parsing import Count
@@ -191,36 +192,6 @@ def load_inputs(options: FrameOptions) -> Inputs:
             encoder.source, encoder.fingerprint, pooling, options.frames, options.aggregation
         )
     return Inputs(encoder, pooling, head)
-
-
-def head_in_use(
-    model: Path, named: Path | None, misfit: Callable[[Head], str] = lambda head: ""
-) -> Head | None:
-    """Return the head that a user named, else that which lies with the encoder.
-
-    Args:
-        model: the encoder.
-        named: the head of --head.
-        misfit: returns the options that the encoder's own head needs, "" if it fits. Else it is
-            left out, which is logged.
-    """
-    from anytouch_jax.encoder.linear_head import find_head, load_head
-    from anytouch_jax.weights import registry
-
-    if named is not None:
-        return load_head(named)
-    if str(model).startswith("hf:"):  # `load_encoder` downloads it
-        return None
-    own = find_head(registry.locate(model))
-    if own is None:
-        return None
-    head = load_head(own)
-    needs = misfit(head)
-    if needs:
-        log(f"the head of {model} is not used: it needs {needs}")
-        return None
-    log(f"head: {own}, for {head.label}")
-    return head
 
 
 def _fits(options: FrameOptions, head: Head) -> str:

@@ -152,6 +152,11 @@ COMMANDS = {
         "calibrate:run",
         "Set the depth of your device by presses of a ball, and its force by a known weight.",
     ),
+    "sensor check": Command(
+        "check:CheckOptions",
+        "check:run",
+        "Compare the untouched gel of today with the stored one: what has changed?",
+    ),
     "report": Command(
         "retrieve:ReportOptions",
         "retrieve:run_report",

@@ -290,7 +290,7 @@ def _recording_gel(
         what = str(stored)
         is_sure = True
     else:
-        own, count = rule.recording_gel(_some_frames(data))
+        own, count = rule.recording_gel(some_frames(data))
         what = f"estimated from {count} frames of {data}"
         is_sure = count >= rule.FEWEST
     counts = rule.recognise(known, own, is_background=is_sure, untouched=stored is not None, of=of)
@@ -309,7 +309,7 @@ def _recording_gel(
     return None, "not subtracted"
 
 
-def _some_frames(data: Path) -> Iterator[np.ndarray]:
+def some_frames(data: Path) -> Iterator[np.ndarray]:
     """Yield evenly spread frames of a folder, all frames of a video, or a picture.
 
     Broken ones are left out.

@@ -27,7 +27,7 @@ from anytouch_jax.fields.outputs import FORCE, LENGTH, TORQUE
 from anytouch_jax.fields.pictures import depth_levels as depth_levels
 from anytouch_jax.fields.pictures import overlay as overlay
 from anytouch_jax.fields.pictures import write_surface as write_surface
-from anytouch_jax.fields.ruler import Ruler, another_encoder, read_ruler
+from anytouch_jax.fields.ruler import Ruler, another_encoder, read_ruler, ruler_of_today
 from anytouch_jax.sensors import RECORDS
 
 
@@ -47,11 +47,10 @@ GELS = {
 # kPa of an unknown gel, and its standard deviation as a fraction of it.
 OTHER_MODULUS = 170.0
 OTHER_SPREAD = 0.4
-# Logarithms of the factors from a force to the ends of its interval, down and up, by what is known
-# of the device. The deviation that the network gives comes on top. Coverage is measured by
+# Logarithms of the factors from a force to the ends of its interval, down and up, of a gel that was
+# not calibrated. The deviation that the network gives comes on top. Coverage is measured by
 # `experiments.encoders.intervals`. Of unknown devices the network reads deep presses too small.
 INTERVALS = {
-    "calibrated": (0.5, 0.5),
     "family": (0.35, 0.35),
     "unknown": (0.9, 1.7),
 }
@@ -76,7 +75,8 @@ class Scale(NamedTuple):
         spread: the modulus' standard deviation as a fraction of it.
         shape: height of the picture over its width, None if nobody knows it.
         factors: by which deviations are multiplied, by name.
-        case: what is known of the device, one of `INTERVALS`.
+        case: what is known of the device: "calibrated" by a known force, a known "family", or
+            "unknown".
     """
 
     width: float | None
@@ -268,15 +268,12 @@ def _forces(out: FieldOutput, scale: Scale, mm: float) -> dict[str, Array]:
     deviation = _deviation(out.force_log)
     sideways = np.repeat(factors["tangential"] * FORCE * deviation[:, :1], 2, axis=1)
     normal = factors["normal"] * (out.force[:, 2:] + LEAST_FORCE) * deviation[:, 1:]
-    down, up = INTERVALS[scale.case]
-    # The network's deviation and what is not known of the device are independent factors.
-    own = Z * factors["normal"] * deviation[:, 1]
-    least = out.force[:, 2] + LEAST_FORCE
-    low = least * np.exp(-np.hypot(own, down)) - LEAST_FORCE
-    high = least * np.exp(np.hypot(own, up)) - LEAST_FORCE
+    low, high = interval_of(
+        out.force[:, 2], factors["normal"] * deviation[:, 1], scale.case, scale.spread
+    )
     values = {
         "force": newton * out.force,
-        "force_low": newton * np.maximum(low, 0),
+        "force_low": newton * low,
         "force_high": newton * high,
         "force_std": newton * np.concatenate([sideways, normal], axis=1),
         "torque": newton * mm * out.torque,
@@ -286,6 +283,25 @@ def _forces(out: FieldOutput, scale: Scale, mm: float) -> dict[str, Array]:
     for name in ("force", "torque"):
         values[f"{name}_std"] = np.hypot(values[f"{name}_std"], scale.spread * values[name])
     return values
+
+
+def interval_of(force: Array, deviation: Array, case: str, spread: float) -> tuple[Array, Array]:
+    """Return the ends of the 90 % intervals of normal forces (B,).
+
+    Errors are factors. That of the network and what is not known of the device are independent.
+
+    Args:
+        force: over modulus times width squared.
+        deviation: of their logarithms, by the network.
+        case: what is known of the device, see INTERVALS, or "calibrated".
+        spread: of a calibrated one, the deviation of the logarithm of its factor.
+    """
+    down, up = INTERVALS.get(case, (Z * spread, Z * spread))
+    own = Z * deviation
+    least = force + LEAST_FORCE
+    low = least * np.exp(-np.hypot(own, down)) - LEAST_FORCE
+    high = least * np.exp(np.hypot(own, up)) - LEAST_FORCE
+    return np.maximum(low, 0), high
 
 
 def _widen(values: dict[str, Any], scale: Scale, mm: float) -> None:
@@ -447,13 +463,19 @@ def measure_of(
         weights: returns the fingerprint of the network, which only a calibration asks for.
 
     Raises:
-        UserError: the sensor was calibrated with another network.
+        UserError: the sensor was calibrated with another network, or the background is not one of
+            it.
     """
     scale = scale_of(metadata, sensor, width_mm)
     word = resolve_sensor(sensor)
     ruler = None if word.folder is None else read_ruler(word.folder)
-    if ruler is not None:
-        ruler.check_network(weights())
     if word.force_spread and weights() != word.force_encoder:
         raise another_encoder()
+    if ruler is not None:
+        ruler.check_network(weights())
+        if background is not None:
+            today = orient_frame(background, rotate, flip)
+            ruler, holds = ruler_of_today(ruler, today, log)
+            if not holds and scale.case == "calibrated":
+                scale = scale._replace(case="unknown", spread=max(scale.spread, OTHER_SPREAD))
     return Measure(scale, word.family or word.name, background, log, rotate, flip, ruler)

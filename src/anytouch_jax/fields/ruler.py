@@ -12,8 +12,8 @@ It is stored as ruler.npz in the folder of the sensor, NAME.sensor.
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ import numpy as np
 from scipy.fft import dctn, idctn
 from threadpoolctl import threadpool_limits
 
+from anytouch_jax.data.background.condition import check_condition
 from anytouch_jax.data.background.dots import Dots, find_dots
 from anytouch_jax.data.background.estimate import DIFFERENT, UntouchedGel
 from anytouch_jax.data.background.rule import reduced
@@ -62,6 +63,9 @@ _OFF = 0.35
 # Factor on the network's depth, up to which it is a reader of this device.
 _READS = 1.6
 _LEAST_SPREAD = 0.03
+# What the condition of a sensor does to its ruler: it is refused, or deviations are so much wider.
+_REFUSED = ("device", "pressed")
+_WIDER = {"gel": 2.0, "worn": 2.0}
 _NOISE = 0.01  # mm
 # Strength of the colours of a device of no known family: the geometric mean of the table's sensors.
 _USUAL = 0.30
@@ -178,6 +182,27 @@ class Ruler:
         """Raise UserError for another network than that of the fit, if that reads depth."""
         if self.by_network and weights != self.weights:
             raise another_encoder()
+
+
+def ruler_of_today(
+    ruler: Ruler, background: Array, log: Callable[[str], None]
+) -> tuple[Ruler, bool]:
+    """Return a ruler with the background of today, and whether the gel is that of its calibration.
+
+    Another gel and a worn one widen the deviations, and `log` gets a sentence.
+
+    Raises UserError for another device, and for a background that shows a press.
+    """
+    found = check_condition(ruler.background, background)
+    chance = found.probabilities[found.state]
+    said = f"the background shows {found.words} ({chance:.0%}) beside that of the calibration"
+    if found.state in _REFUSED:
+        raise UserError(f"{said}. {found.advice}")
+    today = replace(ruler, background=reduced(background))
+    if found.state not in _WIDER:
+        return today, True
+    log(f"{said}: deviations are wider. {found.advice}")
+    return replace(today, spread=_WIDER[found.state] * ruler.spread), False
 
 
 def another_encoder() -> UserError:

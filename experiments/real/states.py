@@ -113,9 +113,11 @@ def smooth(picture: Array) -> Array:
 
 
 def at_distance(before: Array, after: Array, wanted: float) -> Array:
-    """Return `after` with its broad part moved so that it differs by `wanted` grey levels."""
+    """Return `after` with its broad part scaled so that it differs by `wanted` grey levels."""
     broad = smooth(after - before)
     fine = after - before - broad
+    # Dots of one gel alone may differ by more.
+    fine *= min(1.0, 0.7 * wanted / max(float(np.sqrt((fine**2).mean())), 1e-3))
     rest = np.sqrt(max(wanted**2 - float((fine**2).mean()), 1.0))
     scale = rest / max(float(np.sqrt((broad**2).mean())), 1e-3)
     return np.asarray(before + fine + broad * scale)
@@ -232,7 +234,7 @@ def fit(seed: int) -> None:
     values = np.array(rows)
     mean, scale = values.mean(0), values.std(0)
     ready = condition.expanded((values - mean) / scale)
-    model = LogisticRegression(C=0.3, max_iter=3000).fit(ready, states)
+    model = LogisticRegression(C=3.0, max_iter=4000).fit(ready, states)
     np.savez(
         Path(condition.__file__).with_name(condition.FILE),
         mean=mean,

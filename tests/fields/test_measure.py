@@ -6,6 +6,7 @@ import pytest
 from measuring import gel, measuring_weights
 
 import anytouch_jax as at
+from anytouch_jax.data.background.layout import known_gels
 from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.fields import measure as fields
@@ -189,9 +190,7 @@ def test_what_cannot_be_measured_is_one_sentence(encoder, tiny_run):
 
 def faulty(kind: str) -> tuple[np.ndarray, np.ndarray | None]:
     """Return a frame of a real look of the GelSight Mini with a fault, and its background."""
-    real = np.ascontiguousarray(
-        np.repeat(np.repeat(fields.known_gels("gelsight_mini")[0], 4, 0), 4, 1)
-    )
+    real = np.ascontiguousarray(np.repeat(np.repeat(known_gels("gelsight_mini")[0], 4, 0), 4, 1))
     grey = np.repeat(real.mean(2, keepdims=True).astype(np.uint8), 3, 2)
     return {
         "none": (real, real),

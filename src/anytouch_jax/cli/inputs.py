@@ -33,8 +33,8 @@ class SensorOptions:
     # Encoder: a name (`anytouch info encoders`), a run, a weights file, or hf://user/repo.
     model: Path = Path(DEFAULT)
     sensor: str | None = None
-    """Sensor of the frames: a name, or a folder NAME.sensor of `anytouch sensor fit`. Without it,
-    or if it is unknown, the universal tokens are used.
+    """Sensor of the frames: a name, or a folder NAME.sensor of `anytouch sensor fit` or `sensor
+    calibrate`. Without it, or if it is unknown, the universal tokens are used.
     """
     # Picture of the untouched gel: it is subtracted, and decides contact.
     background: Path | None = None

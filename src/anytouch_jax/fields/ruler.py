@@ -14,7 +14,7 @@ from __future__ import annotations
 import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ import numpy as np
 from scipy.fft import dctn, idctn
 from threadpoolctl import threadpool_limits
 
-from anytouch_jax.data.background.condition import check_condition
+from anytouch_jax.data.background.condition import Condition, check_condition
 from anytouch_jax.data.background.dots import Dots, find_dots
 from anytouch_jax.data.background.estimate import DIFFERENT, UntouchedGel
 from anytouch_jax.data.background.rule import reduced
@@ -121,7 +121,7 @@ class Ruler:
 
     @cached_property
     def _dots(self) -> Dots | None:
-        return find_dots(self.background)
+        return _cached_dots(self.background.tobytes(), self.background.shape)
 
     def read(
         self, frames: Sequence[Array], network: Array, touched: Array
@@ -193,12 +193,15 @@ def ruler_of_today(
 
     Raises UserError for another device, and for a background that shows a press.
     """
-    found = check_condition(ruler.background, background)
+    small = reduced(background)
+    found = _cached_condition(
+        ruler.background.tobytes(), ruler.background.shape, small.tobytes(), small.shape
+    )
     chance = found.probabilities[found.state]
     said = f"the background shows {found.words} ({chance:.0%}) beside that of the calibration"
     if found.state in _REFUSED:
         raise UserError(f"{said}. {found.advice}")
-    today = replace(ruler, background=reduced(background))
+    today = replace(ruler, background=small)
     if found.state not in _WIDER:
         return today, True
     log(f"{said}: deviations are wider. {found.advice}")
@@ -216,6 +219,22 @@ def another_encoder() -> UserError:
 def _resized(maps: Array, shape: tuple[int, ...]) -> Array:
     """Return maps (n, h, w) at another height and width."""
     return np.stack([cv2.resize(one.astype(np.float32), (shape[1], shape[0])) for one in maps])
+
+
+# Every batch of frames asks for the same background.
+@lru_cache(maxsize=4)
+def _cached_dots(values: bytes, shape: tuple[int, ...]) -> Dots | None:
+    return find_dots(np.frombuffer(values, np.uint8).reshape(shape))
+
+
+@lru_cache(maxsize=4)
+def _cached_condition(
+    stored: bytes, shape: tuple[int, ...], today: bytes, shape_today: tuple[int, ...]
+) -> Condition:
+    return check_condition(
+        np.frombuffer(stored, np.uint8).reshape(shape),
+        np.frombuffer(today, np.uint8).reshape(shape_today),
+    )
 
 
 def _deepest_around(depth: Array, reach: float, shape: float) -> Array:

@@ -52,6 +52,7 @@ _TRIMMED = 0.6  # fraction of the pixels that a change of light is fitted to
 _ROUNDS = 4
 _SIDE = 160
 _BORDER = 3
+_NOTHING = 0.3  # grey levels
 _SHAPE = 0.03  # difference of the logarithm of height over width
 
 
@@ -96,7 +97,7 @@ def check_condition(stored: Array, today: Array) -> Condition:
     state = max(probabilities, key=lambda name: probabilities[name])
     if probabilities["same"] > _SAME:
         state = "same"
-    return Condition(state, probabilities, float(np.exp(values[0])))
+    return Condition(state, probabilities, float(np.exp(values[0]) - _NOTHING))
 
 
 @lru_cache(maxsize=1)
@@ -204,5 +205,5 @@ def _rms(values: Array) -> float:
 
 
 def _log(value: float) -> float:
-    """Return the logarithm of grey levels, of which a twentieth is nothing."""
-    return float(np.log(value + 0.05))
+    """Return the logarithm of grey levels, of which a third is nothing: noise differs."""
+    return float(np.log(value + _NOTHING))

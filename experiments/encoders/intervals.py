@@ -45,7 +45,7 @@ class IntervalOptions:
     """Count how often true forces lie in their intervals."""
 
     model: Positional[Path]  # Encoder that measures.
-    units: int = 5  # Devices of each family.
+    units: int = 4  # Devices of each family.
     seed: int = 0
     out: Path = Path("experiments/results/intervals.jsonl")  # JSON lines.
 

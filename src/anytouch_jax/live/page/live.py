@@ -12,8 +12,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from anytouch_jax.config import UNIVERSAL
-from anytouch_jax.encoder.sensor_words import resolve_sensor
 from anytouch_jax.errors import UserError
 from anytouch_jax.live.cameras import CameraSettings, LoopedFilm, open_source
 from anytouch_jax.live.examples import EXAMPLE, ExampleCamera
@@ -73,13 +71,11 @@ class Live:
         self._sensor = sensor
         self._camera = camera
         self._log = log
-        # Recordings have the name of the sensor, which may be a folder here.
-        word = sensor or UNIVERSAL
-        self.recorder = LiveRecorder(out, resolve_sensor(word).name)
+        self.recorder = LiveRecorder(out, sensor)
         pooling = "class" if head is None else head.pooling
         self.teacher = Teacher(encoder, self.recorder, pooling, log)
-        self._row = encoder.sensor_row(word, log)
-        self.frames = FrameReader(encoder, word, self._head_in_use, log)
+        self._row = encoder.sensor_row(self.recorder.word, log)
+        self.frames = FrameReader(encoder, self.recorder.word, self._head_in_use, log)
         self._nearest = NearestTouches()
         self._times: deque[tuple[float, float]] = deque(maxlen=_KEPT)
         self._newest = Shown()

@@ -112,15 +112,15 @@ def presses(encoder: Any, name: str, units: int, seed: int) -> Iterator[Presses]
             forces.append(out.force[:, 2] * stiffness)
             numbers.append(np.full(len(_DEPTHS), number))
             background = out.background[0]
-        pictures = np.concatenate(frames)
+        images = np.concatenate(frames)
         width = GELS[name].width * float(unit.zoom)
         force = np.concatenate(forces)
         pressed = force > 0.05
-        read = [
-            encoder.measure(pictures[pressed], background, word, width_mm=width, log=lambda _: None)
+        known, unknown = (
+            encoder.measure(images[pressed], background, word, width_mm=width, log=lambda _: None)
             for word in (name, UNIVERSAL)
-        ]
-        yield Presses(*read, force[pressed], np.concatenate(numbers)[pressed])
+        )
+        yield Presses(known, unknown, force[pressed], np.concatenate(numbers)[pressed])
 
 
 def inside(low: Array, high: Array, true: Array) -> Array:
@@ -165,6 +165,7 @@ def run(options: IntervalOptions) -> int:
             kept.append((name, one))
             for case, read in (("family", one.family), ("unknown", one.unknown)):
                 assert read.force is not None
+                assert read.force_low is not None and read.force_high is not None
                 covered = inside(read.force_low, read.force_high, one.force)
                 cases[case].append((covered, np.abs(read.force[:, 2] / one.force - 1)))
             cases["calibrated"] += list(calibrated(one))

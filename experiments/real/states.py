@@ -40,7 +40,7 @@ FAMILIES = ("gelsight", "gelsight_mini", "digit", "9dtact", "gelslim", "duragel"
 GEL = 15.0  # grey levels
 DEVICE = 26.0
 NOISE = 1.3
-_SHORT = 160  # pixels of the short side of a picture
+_SHORT = 160  # pixels of the short side of an image
 _PITCH = 0.2  # mm of a dent
 _NOISES = (0.3, 2.5)  # from a median of frames to a poor camera
 _FITTED = 60  # devices that the classifier is fitted to
@@ -89,7 +89,7 @@ class Device:
         )
 
     def show(self, unit: Unit, dent: Array | None = None) -> Array:
-        """Return the picture f32 (h, w, 3) of a gel under a dent mm (96, 96), without noise."""
+        """Return the image f32 (h, w, 3) of a gel under a dent mm (96, 96), without noise."""
         skin = np.zeros((96, 96), np.float32) if dent is None else dent
         return np.asarray(_render(self.sensor, self.size)(skin, unit), np.float32)
 
@@ -107,9 +107,9 @@ def _render(sensor: Sensor, size: tuple[int, int]) -> Any:
     return _PROGRAMS[sensor.name, size]
 
 
-def smooth(picture: Array) -> Array:
-    """Return the broad part of a picture."""
-    return np.asarray(cv2.GaussianBlur(picture, (0, 0), 8))
+def smooth(image: Array) -> Array:
+    """Return the broad part of an image."""
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), 8))
 
 
 def at_distance(before: Array, after: Array, wanted: float) -> Array:
@@ -123,21 +123,21 @@ def at_distance(before: Array, after: Array, wanted: float) -> Array:
     return np.asarray(before + fine + broad * scale)
 
 
-def lit(picture: Array, wanted: float, rng: np.random.Generator) -> Array:
-    """Return a picture in light that changes it by `wanted` levels: a plane for each colour."""
-    height, width = picture.shape[:2]
+def lit(image: Array, wanted: float, rng: np.random.Generator) -> Array:
+    """Return an image in light that changes it by `wanted` levels: a plane for each colour."""
+    height, width = image.shape[:2]
     y, x = np.mgrid[:height, :width] / np.array([height, width])[:, None, None] - 0.5
     planes = rng.normal(0, 1, 3) + rng.normal(0, 1, (3,)) * rng.uniform(0, 1.5)
     change = np.stack(
         [planes[c] + rng.normal(0, 1) * x + rng.normal(0, 1) * y for c in range(3)], -1
     )
-    change = picture * change
-    return np.asarray(picture + change * wanted / max(float(np.sqrt((change**2).mean())), 1e-3))
+    change = image * change
+    return np.asarray(image + change * wanted / max(float(np.sqrt((change**2).mean())), 1e-3))
 
 
-def worn(device: Device, unit: Unit, picture: Array, rng: np.random.Generator) -> Array:
-    """Return a picture with scratches, abraded spots, or lost dots."""
-    height, width = picture.shape[:2]
+def worn(device: Device, unit: Unit, image: Array, rng: np.random.Generator) -> Array:
+    """Return an image with scratches, abraded spots, or lost dots."""
+    height, width = image.shape[:2]
     mask = np.zeros((height, width), np.float32)
     strength = rng.uniform(8, 45) * rng.choice([-1, 1])
     kind = rng.integers(3)
@@ -147,7 +147,7 @@ def worn(device: Device, unit: Unit, picture: Array, rng: np.random.Generator) -
             at = (int(rng.uniform(0.1, 0.9) * width), int(rng.uniform(0.1, 0.9) * height))
             cv2.circle(mask, at, int(rng.uniform(0.05, 0.12) * height), 1.0, -1)
         mask = cv2.GaussianBlur(mask, (0, 0), 1)
-        return np.asarray(picture + mask[..., None] * (bare - picture))
+        return np.asarray(image + mask[..., None] * (bare - image))
     if kind == 0:
         for _ in range(rng.integers(1, 4)):
             points = np.cumsum(rng.normal(0, 0.06, (8, 2)) + rng.normal(0, 0.05, 2), 0)
@@ -160,11 +160,11 @@ def worn(device: Device, unit: Unit, picture: Array, rng: np.random.Generator) -
             cv2.circle(mask, at, int(rng.uniform(1.5, 5)), float(rng.uniform(0.5, 1)), -1)
         mask = cv2.GaussianBlur(mask, (0, 0), rng.uniform(0.6, 1.2))
     colour = strength * (1 + rng.normal(0, 0.12, 3))
-    return np.asarray(picture + mask[..., None] * colour)
+    return np.asarray(image + mask[..., None] * colour)
 
 
 def pressed(device: Device, unit: Unit, rng: np.random.Generator) -> Array:
-    """Return a picture of a gel that an object presses."""
+    """Return an image of a gel that an object presses."""
     y, x = (np.mgrid[:96, :96] - 47.5) * _PITCH
     reach = np.array(device.sensor.field[::-1]) * 0.3
     dent = np.zeros((96, 96), np.float32)
@@ -179,15 +179,13 @@ def pressed(device: Device, unit: Unit, rng: np.random.Generator) -> Array:
     return device.show(unit, dent.astype(np.float32))
 
 
-def filmed(picture: Array, noise: float, rng: np.random.Generator) -> Array:
-    """Return a picture as a camera takes it: light of every day, noise and whole levels."""
-    picture = lit(picture, abs(rng.normal(0, 1.5)), rng)
+def filmed(image: Array, noise: float, rng: np.random.Generator) -> Array:
+    """Return an image as a camera takes it: light of every day, noise and whole levels."""
+    image = lit(image, abs(rng.normal(0, 1.5)), rng)
     if rng.uniform() < 0.5:  # the camera moves in its mount by a part of a pixel
         shift = np.float32([[1, 0, rng.normal(0, 0.15)], [0, 1, rng.normal(0, 0.15)]])
-        picture = cv2.warpAffine(
-            picture, shift, picture.shape[1::-1], borderMode=cv2.BORDER_REPLICATE
-        )
-    return np.clip(np.rint(picture + rng.normal(0, noise, picture.shape)), 0, 255).astype(np.uint8)
+        image = cv2.warpAffine(image, shift, image.shape[1::-1], borderMode=cv2.BORDER_REPLICATE)
+    return np.clip(np.rint(image + rng.normal(0, noise, image.shape)), 0, 255).astype(np.uint8)
 
 
 def pairs(

@@ -16,7 +16,7 @@ from anytouch_jax.encoder.encoder import load_encoder
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory):
-    """A folder with weights, and the pictures of presses by known force."""
+    """A folder with weights, and the images of presses by known force."""
     folder = tmp_path_factory.mktemp("calibrate")
     measuring_weights(folder / "weights.safetensors")
     (folder / "balls").mkdir()
@@ -68,7 +68,7 @@ def test_forces_come_from_a_column_too(place, capsys, monkeypatch):
     assert "2 presses of 2 to 3.5 N" in capsys.readouterr().err
     Path("forces.csv").write_text("frame,newton\nother.png,2\n")
     assert calibrate(*more, "--newton", "forces.csv") == 2
-    assert "other.png of it is not among the pictures" in capsys.readouterr().err
+    assert "other.png of it is not among the images" in capsys.readouterr().err
 
 
 def test_check_names_the_state_and_its_status_says_whether_all_is_well(place, capsys, monkeypatch):

@@ -11,7 +11,7 @@ import pytest
 import anytouch_jax as at
 
 # (press, sensor): deepest and mean depth in contact in mm, mean shear in contact along x and y in
-# mm where the picture moves to the right and down by 3 % of its width, force in N
+# mm where the image moves to the right and down by 3 % of its width, force in N
 GOLDEN: dict[tuple[str, str], tuple[float, ...]] = {
     ("dots", "digit"): (0.5204, 0.1554, 0.0011, 0.0159, -0.0048, 0.0067, 2.0998),
     ("dots", "gelsight_mini"): (1.0562, 0.5648, 0.0059, 0.0086, -0.0103, 0.0255, 5.7781),

@@ -125,7 +125,7 @@ def test_exact_slopes_give_a_cone_a_stud_and_stairs_back():
 
 def test_too_few_presses_and_another_size_are_named():
     made = presses()
-    with pytest.raises(UserError, match="2 of 3 pictures show a press"):
+    with pytest.raises(UserError, match="2 of 3 images show a press"):
         rulers.pressed_frames([*made.frames[:2], made.background], made.background)
     with pytest.raises(UserError, match="another size"):
         rulers.pressed_frames(list(made.frames), made.background[:100])

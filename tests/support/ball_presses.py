@@ -14,7 +14,7 @@ POSES = np.array(
 
 
 class Presses(NamedTuple):
-    """Pictures u8 (N, h, w, 3), the background, and the depth (N, h, w) mm in the pictures."""
+    """Images u8 (N, h, w, 3), the background, and the depth (N, h, w) mm in the images."""
 
     frames: np.ndarray
     background: np.ndarray
@@ -44,7 +44,7 @@ def presses(poses=POSES, *, strength=0.21, seed=0) -> Presses:
         depths.append(above + 0.35 * contact * steepest * beyond)
         frames.append(background + change + rng.normal(0, 1.0, background.shape))
 
-    def picture(values):
+    def image(values):
         return np.clip(np.rint(values), 0, 255).astype(np.uint8)
 
-    return Presses(picture(np.stack(frames)), picture(background), np.stack(depths))
+    return Presses(image(np.stack(frames)), image(background), np.stack(depths))

@@ -32,7 +32,7 @@ class CalibrateOptions:
     The folder takes the place of a sensor's name, in every command and function.
     """
 
-    # Folder of pictures of one device, upright. background.png in it is the untouched gel.
+    # Folder of images of one device, upright. background.png in it is the untouched gel.
     frames: Annotated[Path, Positional]
     sensor: str = UNIVERSAL
     """What your device is: the name of a known sensor, or a folder NAME.sensor that gets a further
@@ -42,11 +42,11 @@ class CalibrateOptions:
     ball_mm: Above0[float | None] = None  # Diameter of the ball that is pressed, mm.
     newton: str | None = None
     """Force of the presses into the gel: one number, N, or a CSV file with the columns frame (the
-    name of a picture) and newton.
+    name of an image) and newton.
     """
-    # What the width of a picture shows, mm. Known and fitted sensors need none.
+    # What the width of an image shows, mm. Known and fitted sensors need none.
     width_mm: Above0[float | None] = None
-    # Picture of the untouched gel. Without it, background.png, else the median of all pictures.
+    # Image of the untouched gel. Without it, background.png, else the median of all images.
     background: Path | None = None
     # Encoder that measures: a name, a run, a weights file, or hf://user/repo.
     model: Path = Path(DEFAULT)
@@ -102,34 +102,34 @@ def _place(options: CalibrateOptions) -> Path:
 
 
 def _read(options: CalibrateOptions) -> tuple[list[Path], np.ndarray, list[np.ndarray]]:
-    """Return the pictures with their files, and the untouched gel between them.
+    """Return the images with their files, and the untouched gel between them.
 
-    Raises UserError for pictures of several sizes, or too few for a median.
+    Raises UserError for images of several sizes, or too few for a median.
     """
     from anytouch_jax.data.background.rule import FEWEST, recording_gel
     from anytouch_jax.data.images import BACKGROUND, decode, list_images
 
     files, named = list_images(options.frames)
     if not files:
-        raise UserError(f"there are no pictures in {options.frames}")
+        raise UserError(f"there are no images in {options.frames}")
     frames = [decode(file) for file in files]
     sizes = {frame.shape for frame in frames}
     if len(sizes) > 1:
-        raise UserError(f"the pictures have {len(sizes)} sizes. Give those of one camera.")
+        raise UserError(f"the images have {len(sizes)} sizes. Give those of one camera.")
     path = options.background or named.get(BACKGROUND)
     if path is not None:
         return files, decode(path), frames
     if len(frames) < FEWEST:
         raise UserError(
-            f"{len(frames)} pictures do not show the untouched gel. Name a picture of it with "
+            f"{len(frames)} images do not show the untouched gel. Name an image of it with "
             "--background."
         )
-    log(f"untouched gel: the median of {len(frames)} pictures")
+    log(f"untouched gel: the median of {len(frames)} images")
     return files, recording_gel(frames)[0], frames
 
 
 def _forces(word: str, files: list[Path]) -> dict[str, float]:
-    """Return the known force of each picture by its name, in their order. Raises UserError."""
+    """Return the known force of each image by its name, in their order. Raises UserError."""
     try:
         force = float(word)
     except ValueError:
@@ -151,5 +151,5 @@ def _forces(word: str, files: list[Path]) -> dict[str, float]:
     strange = [name for name in known if name not in names]
     if strange or not known:
         what = f"{strange[0]} of it is not" if strange else "none of its lines is"
-        raise UserError(f"{path}: {what} among the pictures")
+        raise UserError(f"{path}: {what} among the images")
     return {file.name: known[file.name] for file in files if file.name in known}

@@ -27,10 +27,10 @@ class CheckOptions:
     any more.
     """
 
-    # Picture of the untouched gel of today, or a folder or video of it.
+    # Image of the untouched gel of today, or a folder or video of it.
     today: Annotated[Path, Positional]
     sensor: Path | None = None  # Folder NAME.sensor of `anytouch sensor calibrate`.
-    background: Path | None = None  # Or the stored picture itself.
+    background: Path | None = None  # Or the stored image itself.
 
 
 def run(options: CheckOptions) -> int:
@@ -60,18 +60,18 @@ def _stored(options: CheckOptions) -> np.ndarray:
     if ruler is None:
         raise UserError(
             f"{options.sensor} has no stored background: make one with `anytouch sensor calibrate "
-            "--ball-mm`, or name a picture with --background"
+            "--ball-mm`, or name an image with --background"
         )
     return ruler.background
 
 
 def _today(path: Path) -> np.ndarray:
-    """Return the picture of today: of several frames the median, which has less noise."""
+    """Return the image of today: of several frames the median, which has less noise."""
     from anytouch_jax.cli.inputs import some_frames
     from anytouch_jax.data.background.rule import alike, median, reduced
 
     if not path.exists():
-        raise UserError(f"there is no picture, folder or video at {path}")
+        raise UserError(f"there is no image, folder or video at {path}")
     frames = alike([reduced(frame) for frame in some_frames(path)])
     if not frames:
         raise UserError(f"no frame of {path} can be read")

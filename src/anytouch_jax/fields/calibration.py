@@ -38,7 +38,7 @@ def sensor_numbers(
     Args:
         sensor: a folder NAME.sensor, or the name of a known or unknown sensor.
         out: the folder to write.
-        shape: of a picture, (height, width, 3).
+        shape: of an image, (height, width, 3).
         width_mm: what its width shows. Known sensors need none.
 
     Raises:
@@ -57,7 +57,7 @@ def sensor_numbers(
     if width_mm is None:
         if gel is None:
             raise UserError(
-                f"nobody knows what a picture of {sensor} shows. Give the mm of its width: "
+                f"nobody knows what an image of {sensor} shows. Give the mm of its width: "
                 "--width-mm 16"
             )
         width_mm = gel.width
@@ -124,7 +124,7 @@ def calibrate_force(
         newtons: the known force of each, N into the gel.
 
     Raises:
-        UserError: a force that is none, and a picture without a press.
+        UserError: a force that is none, and an image without a press.
     """
     if not all(0 < one < np.inf for one in newtons):
         raise UserError("a known force is a number of N above 0. Check --newton.")
@@ -139,7 +139,7 @@ def calibrate_force(
     empty = int((forces < _LEAST_NEWTON).sum())
     if empty:
         raise UserError(
-            f"{empty} of {len(frames)} pictures show no press. Leave them out, or check the "
+            f"{empty} of {len(frames)} images show no press. Leave them out, or check the "
             "background."
         )
     ratios = np.log(np.asarray(newtons, float) / forces)

@@ -25,7 +25,7 @@ from threadpoolctl import threadpool_limits
 
 from anytouch_jax.data.background.condition import Condition, check_condition
 from anytouch_jax.data.background.dots import Dots, find_dots
-from anytouch_jax.data.background.estimate import DIFFERENT, UntouchedGel, change_of_light
+from anytouch_jax.data.background.estimate import DIFFERENT, UntouchedBackground, change_of_light
 from anytouch_jax.data.background.rule import reduced
 from anytouch_jax.encoder.arrays import Array
 from anytouch_jax.errors import UserError
@@ -84,7 +84,7 @@ class Ruler:
     Attributes:
         background: its untouched gel u8 (h, w, 3), at most 320 pixels long.
         colours: (25, 2), sines of the tilt along x and y by powers of the colour change.
-        width_mm: what the width of a picture shows.
+        width_mm: what the width of an image shows.
         gain: by which a reader's depth is multiplied.
         by_network: whether the network is the reader, and not the colours.
         weights: fingerprint of the network.
@@ -129,7 +129,7 @@ class Ruler:
         """Return depth mm, its deviation, and the probability of contact, f32 (n, h, w) each.
 
         Args:
-            frames: n pictures RGB u8 of the proportions of `background`.
+            frames: n images RGB u8 of the proportions of `background`.
             network: (n, h, w), depth mm that the network reads of them.
             touched: (n, h, w), the probability of contact by the network. It says that something
                 touches, and the ruler where its rim is.
@@ -150,7 +150,7 @@ class Ruler:
     def _change(self, frame: Array) -> Array:
         """Return the colour change f32 (h, w, 3) of a frame, as `colour_changes` does."""
         if self._dots is None:
-            # The same from small pictures, in a quarter of the time, because there is no ink.
+            # The same from small images, in a quarter of the time, because there is no ink.
             size = self._small.shape[1::-1]
             change = cv2.resize(frame, size, interpolation=cv2.INTER_AREA) - self._small
             return np.asarray((change - change_of_light(change)) / 255, np.float32)
@@ -254,7 +254,7 @@ def _cached_condition(
 def _deepest_around(depth: Array, reach: float, shape: float) -> Array:
     """Return the depth of the deepest place within `reach` columns of each.
 
-    `shape` is the height of the picture over its width, because pixels of a map are not square.
+    `shape` is the height of the image over its width, because pixels of a map are not square.
     """
     height, width = depth.shape
     down = reach * height / (width * shape)
@@ -285,7 +285,7 @@ def surface_of(change: Array, colours: Array, width_mm: float) -> Array:
     Args:
         change: 0 to 1.
         colours: (25, 2), see `Ruler`.
-        width_mm: what the width of the picture shows.
+        width_mm: what the width of the image shows.
     """
     height, width = change.shape[:2]
     # Not a product of BLAS, whose threads wait for each other in a live stream.
@@ -312,7 +312,7 @@ def _border_plane(depth: Array) -> Array:
     values = depth.ravel()[at_border]
     weight = np.ones(len(values))
     for _ in range(5):
-        # Least absolute deviations by weights: a contact that leaves the picture is no border.
+        # Least absolute deviations by weights: a contact that leaves the image is no border.
         plane = np.linalg.solve(border.T @ (weight[:, None] * border), border.T @ (weight * values))
         weight = 1 / np.maximum(np.abs(values - border @ plane), 1e-3)
     return np.asarray((terms @ plane).reshape(height, width))
@@ -351,11 +351,11 @@ def pressed_frames(frames: Sequence[Array], background: Array) -> list[Array]:
             "the background has another size than the presses. Take all with one setting of the "
             "camera."
         )
-    untouched = UntouchedGel(gel)
+    untouched = UntouchedBackground(gel)
     pressed = [frame for frame in frames if untouched.score(frame) >= DIFFERENT]
     if len(pressed) < FEWEST:
         raise UserError(
-            f"{len(pressed)} of {len(frames)} pictures show a press. Press the ball {FEWEST} times "
+            f"{len(pressed)} of {len(frames)} images show a press. Press the ball {FEWEST} times "
             "or more, at changing places and depths; 5 are good."
         )
     return pressed
@@ -377,7 +377,7 @@ def fit_ruler(
         frames: N presses RGB u8 (h, w, 3) by one device (`pressed_frames`).
         network: (N, H, W), depth mm of them that the network reads.
         background: the untouched gel.
-        width_mm: what the width of a picture shows.
+        width_mm: what the width of an image shows.
         ball_mm: diameter of the ball.
         family: the sensor of the table that the device is one of.
         weights: fingerprint of the network.
@@ -488,7 +488,7 @@ class _Presses:
     Args:
         changes: colour changes f32 (N, h, w, 3), 0 to 1.
         poses: (N, 3) of `Balls`.
-        width_mm: what the width of a picture shows.
+        width_mm: what the width of an image shows.
         radius: that of the ball, mm.
     """
 

@@ -1,4 +1,4 @@
-"""The condition of a sensor: each state is told from the others on pictures of a made gel."""
+"""The condition of a sensor: each state is told from the others on images of a made gel."""
 
 import cv2
 import numpy as np
@@ -17,9 +17,9 @@ def gel(seed: int, side: int = 160) -> np.ndarray:
     return 120 + broad + fine
 
 
-def filmed(picture: np.ndarray, seed: int) -> np.ndarray:
-    noise = np.random.default_rng(seed).normal(0, 1.3, picture.shape)
-    return np.clip(np.rint(picture + noise), 0, 255).astype(np.uint8)
+def filmed(image: np.ndarray, seed: int) -> np.ndarray:
+    noise = np.random.default_rng(seed).normal(0, 1.3, image.shape)
+    return np.clip(np.rint(image + noise), 0, 255).astype(np.uint8)
 
 
 def scaled(one: np.ndarray, other: np.ndarray, levels: float) -> np.ndarray:
@@ -35,7 +35,7 @@ def test_states_are_told_apart(seed):
         cv2.line(scratched, (30 + shift, 20), (60 + shift, 90), (170, 172, 168), 1)
     x = np.linspace(-0.5, 0.5, one.shape[1])[None, :, None]
     made = presses(POSES[2:3], seed=seed)
-    pictures = {
+    images = {
         "same": one + 1,
         "gel": scaled(one, gel(100 + seed), 15),
         "device": scaled(one, gel(200 + seed), 27),
@@ -44,8 +44,8 @@ def test_states_are_told_apart(seed):
         "pressed": one + (made.frames[0].astype(float) - made.background),
     }
     wrong = []
-    for state, picture in pictures.items():
-        found = check_condition(filmed(one, seed), filmed(picture, 50 + seed))
+    for state, image in images.items():
+        found = check_condition(filmed(one, seed), filmed(image, 50 + seed))
         assert set(found.probabilities) == set(STATES)
         assert sum(found.probabilities.values()) == pytest.approx(1)
         if found.state != state:
@@ -62,6 +62,6 @@ def test_an_unchanged_gel_gives_no_alarm():
     assert not any(alarms)
 
 
-def test_pictures_of_other_proportions_are_refused():
+def test_images_of_other_proportions_are_refused():
     with pytest.raises(UserError, match="other proportions"):
         check_condition(filmed(gel(0), 0), filmed(gel(0)[:80], 0))

@@ -1,4 +1,4 @@
-"""Places of a ball in pictures of a device whose lights nobody knows."""
+"""Places of a ball in images of a device whose lights nobody knows."""
 
 import numpy as np
 from ball_presses import DIAMETER, POSES, WIDTH, presses
@@ -26,7 +26,7 @@ def test_places_and_contacts_are_found_without_knowing_the_lights():
     )
 
 
-def test_a_larger_ball_has_stronger_colours_for_the_same_pictures():
+def test_a_larger_ball_has_stronger_colours_for_the_same_images():
     made = presses()
     change, clear = colour_changes(list(made.frames), made.background, None)
     strength = [place_balls(change, clear, WIDTH, size).strength for size in (6.0, 12.0)]

@@ -1,7 +1,7 @@
 """Condition of a sensor: its background of today beside the stored one.
 
 The same gel, another gel, another device, a worn gel, other light, or something that presses:
-features of the two pictures tell these states apart, with probabilities (multinomial logistic
+features of the two images tell these states apart, with probabilities (multinomial logistic
 regression). It was fitted to simulated pairs at distances that were measured in public: another gel
 on one device differs by 15 grey levels (root mean square), another device by 26, and noise is 1.3
 (`experiments.real.states`, which fits it, and counts how often it is right).
@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from anytouch_jax.data.background.estimate import scale_picture
+from anytouch_jax.data.background.estimate import scale_image
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import read_arrays
 
@@ -81,9 +81,9 @@ class Condition(NamedTuple):
 
 
 def check_condition(stored: Array, today: Array) -> Condition:
-    """Return the state of a sensor from two pictures u8 (h, w, 3) of its untouched gel.
+    """Return the state of a sensor from two images u8 (h, w, 3) of its untouched gel.
 
-    Raises UserError for pictures of other proportions.
+    Raises UserError for images of other proportions.
     """
     values = features_of(stored, today)
     with (files("anytouch_jax.data.background") / FILE).open("rb") as file:
@@ -115,13 +115,13 @@ def expanded(values: Array) -> Array:
 
 
 def features_of(stored: Array, today: Array) -> Array:
-    """Return the features f64 (12,) of two pictures, most of them logarithms of grey levels."""
+    """Return the features f64 (12,) of two images, most of them logarithms of grey levels."""
     if abs(np.log(stored.shape[0] * today.shape[1] / (stored.shape[1] * today.shape[0]))) > _SHAPE:
         raise UserError(
             "the two backgrounds have other proportions. Take both with one setting of the camera."
         )
-    before = scale_picture(stored, _SIDE).astype(np.float32)
-    after = scale_picture(today, _SIDE)
+    before = scale_image(stored, _SIDE).astype(np.float32)
+    after = scale_image(today, _SIDE)
     if after.shape != before.shape:
         after = cv2.resize(after, before.shape[1::-1], interpolation=cv2.INTER_AREA)
     after = after.astype(np.float32)
@@ -188,10 +188,10 @@ def _light(before: Array, after: Array) -> Array:
 
 
 def _texture(before: Array, after: Array, calm: Array) -> float:
-    """Return the correlation of fine details of two pictures, where nothing changed strongly."""
+    """Return the correlation of fine details of two images, where nothing changed strongly."""
     details = []
-    for picture in (before, after):
-        grey = picture.mean(2)
+    for image in (before, after):
+        grey = image.mean(2)
         detail = cv2.GaussianBlur(grey, (0, 0), 0.7) - cv2.GaussianBlur(grey, (0, 0), 2.5)
         details.append(detail[_BORDER:-_BORDER, _BORDER:-_BORDER][calm])
     if calm.sum() < 100:

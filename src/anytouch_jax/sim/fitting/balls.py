@@ -1,4 +1,4 @@
-"""Places of a ball of known size in pictures of its presses, whatever the lights and the gel are.
+"""Places of a ball of known size in images of its presses, whatever the lights and the gel are.
 
 Inside its contact the gel has the form of the ball, so the normal of the surface is linear in the
 place. Its sine of the tilt grows to the rim and falls off outside: this kink is what shows the rim.
@@ -21,8 +21,8 @@ Array = np.ndarray
 # The slope outside falls by e in so many radii of the contact, beside what it does on a half-space:
 # a gel is a layer. So are slopes of balls that the simulator presses into gels of 1.8 to 4.6 mm.
 _LAYER = 2.0
-_SIDE = 64  # pixels of the long side of the pictures that are searched
-_WINDOW = 2.2  # of the first radius: the part of a picture that is explained
+_SIDE = 64  # pixels of the long side of the images that are searched
+_WINDOW = 2.2  # of the first radius: the part of an image that is explained
 _STEEPEST = 0.97  # sine of the tilt of a rim. Beyond, a ball is pressed in to its middle.
 _POWERS = tuple((i - j, j) for i in (1, 2, 3) for j in range(i + 1))
 _BLEED = 1.5  # radii of the soft shadow and light around a contact
@@ -43,7 +43,7 @@ class Balls(NamedTuple):
     """Presses of a ball that are placed.
 
     Attributes:
-        poses: (N, 3) place x and y from the middle of the picture, and radius of the contact, mm.
+        poses: (N, 3) place x and y from the middle of the image, and radius of the contact, mm.
         explained: fraction of the colour change around the contacts.
         strength: colour change (0 to 1) for a sine of the tilt, root mean square.
     """
@@ -54,7 +54,7 @@ class Balls(NamedTuple):
 
 
 def grid_of(shape: tuple[int, ...], width_mm: float) -> Grid:
-    """Return the places of square pixels (h, w) of a picture that shows `width_mm`."""
+    """Return the places of square pixels (h, w) of an image that shows `width_mm`."""
     height, width = shape[:2]
     pixel = width_mm / width
     x, y = np.meshgrid(
@@ -162,7 +162,7 @@ def place_balls(change: Array, clear: Array, width_mm: float, ball_mm: float) ->
     Args:
         change: colour changes f32 (N, h, w, 3) of the presses, 0 to 1.
         clear: bool (N, h, w), where they show.
-        width_mm: what the width of a picture shows.
+        width_mm: what the width of an image shows.
         ball_mm: diameter of the ball.
     """
     radius = ball_mm / 2

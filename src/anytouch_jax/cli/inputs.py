@@ -35,8 +35,8 @@ class SensorOptions:
     # Encoder: a name (`anytouch info encoders`), a run, a weights file, or hf://user/repo.
     model: Path = Path(DEFAULT)
     sensor: str | None = None
-    """Sensor of the frames: a name, or a folder NAME.sensor of `anytouch sensor fit`. Without it,
-    or if it is unknown, the universal tokens are used.
+    """Sensor of the frames: a name, or a folder NAME.sensor of `anytouch sensor fit` or `sensor
+    calibrate`. Without it, or if it is unknown, the universal tokens are used.
     """
     # Image of the untouched gel: it is subtracted, and decides contact.
     background: Path | None = None
@@ -315,7 +315,7 @@ def _recording_gel(
         what = str(stored)
         is_sure = True
     else:
-        own, count = rule.recording_gel(_some_frames(data))
+        own, count = rule.recording_gel(some_frames(data))
         what = f"estimated from {count} frames of {data}"
         is_sure = count >= rule.FEWEST
     counts = rule.recognise(known, own, is_background=is_sure, untouched=stored is not None, of=of)
@@ -334,7 +334,7 @@ def _recording_gel(
     return None, "not subtracted"
 
 
-def _some_frames(data: Path) -> Iterator[np.ndarray]:
+def some_frames(data: Path) -> Iterator[np.ndarray]:
     """Yield evenly spread frames of a folder, all frames of a video, or an image.
 
     Broken ones are left out.

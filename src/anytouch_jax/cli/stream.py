@@ -73,8 +73,8 @@ class StreamOptions(CameraOptions, inputs.FrameOptions):
     frames are equal).
     """
     fields: bool = False
-    """Also measure: each line has force, torque, depth, area, centre and slip, in N and mm, with
-    deviations. Shear and slip need --frames 3.
+    """Also measure: each line has force with its interval, torque, depth, area, centre and slip, in
+    N and mm, with deviations. Shear and slip need --frames 3.
     """
     # --fields: mm that the image's width shows. Known sensors need none.
     width_mm: Above0[float | None] = None

@@ -18,6 +18,7 @@ from anytouch_jax.config import UNIVERSAL
 from anytouch_jax.data.images import encode
 from anytouch_jax.data.manifest.schema import EMPTY
 from anytouch_jax.encoder.arrays import Array
+from anytouch_jax.encoder.sensor_words import resolve_sensor
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import read_arrays
 from anytouch_jax.live.page.shared import SharedManifest
@@ -53,7 +54,9 @@ class LiveRecorder:
     def __init__(self, out: Path, sensor: str | None) -> None:
         self.out = out.expanduser().resolve()
         self.named = out
-        self.sensor = sensor or UNIVERSAL
+        # What the user calls the sensor may be its folder. Recordings have its name.
+        self.word = sensor or UNIVERSAL
+        self.sensor = resolve_sensor(self.word).name
         self.manifest = SharedManifest(self.out)
         self.file = self.manifest.file
         # of recorded frames, by their path in the manifest

@@ -19,14 +19,15 @@ from anytouch_jax.sim.dataset import simulate
 from anytouch_jax.sim.scene import Scenes
 from anytouch_jax.train.progress import silent
 
-DEMO = Path(__file__).resolve().parents[2] / "runs" / "demo" / "scenes"  # those of `make demo`
+FOLDER = Path(__file__).resolve().parents[2] / "runs" / "notebooks" / "scenes"
 
 
 def scenes() -> at.Manifest:
-    """Return the manifest of the scenes of `make demo`, or of the folder SCENES. They are simulated
-    if missing.
+    """Return the manifest of the scenes of the notebooks, or of the folder SCENES.
+
+    They are simulated if they are missing.
     """
-    folder = Path(os.environ.get("SCENES") or DEMO)
+    folder = Path(os.environ.get("SCENES") or FOLDER)
     if not (folder / "manifest.parquet").exists():
         simulate(Scenes(touches=500, objects=250, size=128), folder)
     return at.read_manifest(folder / "manifest.parquet")

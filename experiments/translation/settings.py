@@ -10,7 +10,7 @@ from typing import Any
 TASKS = (("gelsight_mini", "duragel"), ("gelsight_mini", "tac3d"), ("digit", "tac3d"))
 TRANSLATIONS = dict(
     zip(
-        map("-".aggregation, TASKS),
+        map("-".join, TASKS),
         ("GelSight Mini to DuraGel", "GelSight Mini to Tac3D", "DIGIT to Tac3D"),
         strict=True,
     )

@@ -67,7 +67,11 @@ CORE: dict[str, set[str]] = {
     # train.loop: tokens of a new sensor are trained by the loop that trains everything
     "encoder": {"nn", "weights", "objectives", "ops", "data", "config", "train"},
     # objectives: the errors of stage 1 on pixels are measured by its own functions
-    "evaluate": {"encoder", "objectives", "data", "nn.functional", "ops", "config"},
+    # weights.registry: whether another package brings the control of every probe
+    "evaluate": {
+        "encoder", "objectives", "data", "nn.functional", "ops", "config", "weights.registry",
+    },
+    "finetuning": {"objectives", "weights", "data", "config", "train", "encoder", "evaluate"},
     "training": {
         "nn", "objectives", "ops", "weights", "data", "config", "train", "encoder", "evaluate",
     },
@@ -103,6 +107,8 @@ ONLY_IN: dict[str, set[str]] = {
     "pickle": {"zoo.torch_file", "datasets.readers.common"},
     "starlette": {"live.page"},
     "uvicorn": {"live.page"},
+    "mujoco": {"sim.mujoco"},
+    "gymnasium": {"sim.mujoco"},
     "importlib": {"__init__", "doors", "errors", "renamed"},
 }
 WITHOUT_JAX = {"data", "config", "batch", "datasets"} | GROUND

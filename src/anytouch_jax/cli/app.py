@@ -137,6 +137,11 @@ COMMANDS = {
         "probe:run_benchmark",
         "Probe a public benchmark with the authors' settings.",
     ),
+    "finetune": Command(
+        "finetune:FinetuneOptions",
+        "finetune:run",
+        "Train the encoder and a head on your labels, in minutes.",
+    ),
     "retrieve": Command(
         "retrieve:RetrieveOptions",
         "retrieve:run_retrieve",

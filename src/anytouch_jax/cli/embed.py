@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from anytouch_jax.data.manifest.manifest import Manifest
     from anytouch_jax.encoder.embed import Features, NumberedFrame
     from anytouch_jax.encoder.encoder import Encoder
-    from anytouch_jax.encoder.linear_head import LinearHead
+    from anytouch_jax.encoder.linear_head import Head
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -165,7 +165,7 @@ def _embed_rows(work: _Work, source: _Rows) -> Features:
         if name in others or name.startswith("label."):
             keys[name] = embedding.plain_column(manifest, name)[rows]
     predictions = {}
-    if options.head is not None:
+    if work.inputs.head is not None:
         predictions["contact"] = contact_of_rows(manifest, rows, source.backgrounds)
     images = {} if source.backgrounds is None else source.backgrounds.images(rows)
     skipped = len(source.rows) - len(rows)
@@ -210,7 +210,7 @@ def save_features(
     out: Path,
     encoder: Encoder,
     features: Features,
-    head: LinearHead | None,
+    head: Head | None,
     options: FrameOptions,
     about: dict[str, str],
 ) -> None:
@@ -227,7 +227,7 @@ def save_features(
     from anytouch_jax.encoder.embed import save_npz
 
     if head is not None and len(features.values):
-        predictions = features.predictions | _predictions(head, features.values)
+        predictions = features.predictions | head.predictions(features.values)
         features = replace(features, predictions=predictions)
         named = None if options.sensor is None else options.sensor_name
         _log_other_sensors(head, features, named)
@@ -241,7 +241,7 @@ def save_features(
     )
 
 
-def _log_other_sensors(head: LinearHead, features: Features, named: str | None) -> None:
+def _log_other_sensors(head: Head, features: Features, named: str | None) -> None:
     """Log if features look like another sensor than the one named, or that of their rows."""
     calibration = head.calibration
     if calibration is None:
@@ -256,25 +256,6 @@ def _log_other_sensors(head: LinearHead, features: Features, named: str | None) 
         warning = calibration.sensor_warning(head.scaled(values), name)
         if warning:
             log(warning)
-
-
-def _predictions(head: LinearHead, values: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the arrays that a head adds to features.
-
-    These are label and p, and of a calibrated head set, classes and novelty.
-    """
-    if head.calibration is None:
-        label, p = head(values)
-        return {"label": label, "p": p.max(1)}
-    assessed = head.assess(values)
-    return {
-        "label": assessed.label,
-        "p": assessed.p.max(1),
-        "set": assessed.in_set,
-        "classes": head.classes,
-        "novelty": assessed.novelty,
-        "novel": assessed.novel,
-    }
 
 
 def _write_columns(root: Path, column: str, features: Features) -> None:

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from anytouch_jax.encoder.encoder import Encoder
+    from anytouch_jax.encoder.linear_head import Head
     from anytouch_jax.weights.safetensors import Loaded
 
 _INT8 = ("int8", "data", "fields")
@@ -69,8 +70,10 @@ class ExportOptions:
     frames: Count[int] = 1
     # jax: the platforms it runs on.
     platforms: tuple[Literal["cpu", "cuda", "rocm", "tpu"], ...] = ("cpu", "cuda")
-    # jax, onnx: class token, mean of patch tokens, or both.
-    pooling: Literal["class", "mean", "both"] = "class"
+    pooling: Literal["class", "mean", "both"] | None = None
+    """jax, onnx: class token, mean of patch tokens, or both (default: that of the head of MODEL,
+    else class).
+    """
     # jax: how the segments of a long clip are joined.
     aggregation: Literal["mean", "sum", "concat"] = "mean"
     dtype: Literal["trained", "float32", "bfloat16"] = "trained"
@@ -105,6 +108,7 @@ def _export_encoder(options: ExportOptions, out: Path) -> int:
             "neither."
         )
     from anytouch_jax.encoder.encoder import load_encoder
+    from anytouch_jax.encoder.linear_head import HEAD, save_head
     from anytouch_jax.export import export as exports
     from anytouch_jax.train.mesh import enable_compilation_cache
 
@@ -112,11 +116,12 @@ def _export_encoder(options: ExportOptions, out: Path) -> int:
     enable_compilation_cache()
     encoder = load_encoder(options.model).computed_in("float32" if is_onnx else options.dtype)
     refuse_join(options, encoder.config.model.frames)
+    head = _own_head(options)
     settings = exports.ExportSettings(
         form="onnx" if is_onnx else "jax",
         frames=options.frames,
         platforms=options.platforms,
-        pooling=options.pooling,
+        pooling=options.pooling or ("class" if head is None else head.pooling),
         aggregation=options.aggregation,
         fields=options.fields,
     )
@@ -139,7 +144,26 @@ def _export_encoder(options: ExportOptions, out: Path) -> int:
             f"on {measured['touches']} touches"
         )
     print(f"{exports.describes(out)}: how to call it")
+    if head is not None:
+        beside = out.with_suffix(f".{HEAD}")
+        save_head(beside, head)
+        print(f"{beside}: its head for {head.label}, which at.load_head reads")
     return 0
+
+
+def _own_head(options: ExportOptions) -> Head | None:
+    """Return the head of `anytouch finetune` that reads the exported features, None without one."""
+    from anytouch_jax.cli.inputs import head_in_use
+
+    def misfit(head: Head) -> str:
+        wrong = []
+        if options.pooling not in (None, head.pooling):
+            wrong.append(f"--pooling {head.pooling}")
+        if options.frames != head.frames:
+            wrong.append(f"--frames {head.frames}")
+        return " ".join(wrong)
+
+    return head_in_use(options.model, None, misfit)
 
 
 def _calibration(

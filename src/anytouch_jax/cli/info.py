@@ -388,12 +388,15 @@ def _arrays(path: Path) -> list[str]:
         )
     except (OSError, ValueError) as error:
         raise UserError(f"{path} is not a whole .npz file of plain arrays: {error}.") from None
-    if {"format", "mark", "classes"} <= arrays.keys():
-        from anytouch_jax.encoder.linear_head import load_head
+    if {"format", "mark"} <= arrays.keys():
+        from anytouch_jax.encoder.linear_head import LinearHead, load_head
 
         head = load_head(path)
+        what = "a number"
+        if isinstance(head, LinearHead):
+            what = ", ".join(head.classes)
         return [
-            f"{path}: a linear head for {head.label}: {', '.join(head.classes)}",
+            f"{path}: a linear head for {head.label}: {what}",
             f"for features of {len(head.mean)} with --pooling {head.pooling} --frames "
             f"{head.frames}, encoder {head.fingerprint}",
             *(head.promises() or ["without calibration: save it again"]),

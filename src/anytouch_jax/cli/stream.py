@@ -20,7 +20,7 @@ from anytouch_jax.errors import UserError
 
 if TYPE_CHECKING:
     from anytouch_jax.encoder.encoder import Encoder
-    from anytouch_jax.encoder.linear_head import LinearHead
+    from anytouch_jax.encoder.linear_head import Head
     from anytouch_jax.encoder.measured import Measure
     from anytouch_jax.live.cameras import CameraSettings
     from anytouch_jax.live.page.live import Live
@@ -215,7 +215,7 @@ def _save_stream(
     embed.save_features(options.out, given.encoder, features, given.head, options, about)
 
 
-def _print_line(frame: Embedded, live: bool, head: LinearHead | None) -> None:
+def _print_line(frame: Embedded, live: bool, head: Head | None) -> None:
     """Print a frame as a line of JSON."""
     line: dict[str, Any] = {"frame": frame.number, "time": round(frame.time, 6)}
     if live:
@@ -224,7 +224,7 @@ def _print_line(frame: Embedded, live: bool, head: LinearHead | None) -> None:
     if frame.estimated:
         line["background"] = "estimated"
     if head is not None:
-        line |= _predicted(head, frame)
+        line |= head.summary(frame.values[None])
     is_known = frame.contact == frame.contact  # NaN is unknown
     line["contact"] = bool(frame.contact) if is_known else None
     if frame.fields is not None:
@@ -232,21 +232,6 @@ def _print_line(frame: Embedded, live: bool, head: LinearHead | None) -> None:
     # The shortest digits that are read back as the same float32.
     line["features"] = [float(str(value)) for value in frame.values]
     print(json.dumps(line), flush=True)
-
-
-def _predicted(head: LinearHead, frame: Embedded) -> dict[str, Any]:
-    """Return the class of a frame, and what the calibration of the head says of it."""
-    features = frame.values[None]
-    if head.calibration is None:
-        (label,), p = head(features)
-        return {"label": str(label), "p": round(float(p.max()), 6)}
-    one = head.assess(features)
-    return {
-        "label": str(one.label[0]),
-        "p": round(float(one.p.max()), 6),
-        "set": head.classes[one.in_set[0]].tolist(),
-        "novel": bool(one.novel[0]),
-    }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -329,7 +314,6 @@ def _is_video(path: Path) -> bool:
 def _open_camera(options: ViewOptions, camera: str, sources: list[Source]) -> Live:
     """Return the live page of a camera, or of a video in its place."""
     from anytouch_jax.encoder.encoder import load_encoder
-    from anytouch_jax.encoder.linear_head import load_head
     from anytouch_jax.live.examples import EXAMPLE, SENSOR
     from anytouch_jax.live.page.live import Live
     from anytouch_jax.train.mesh import enable_compilation_cache
@@ -338,7 +322,7 @@ def _open_camera(options: ViewOptions, camera: str, sources: list[Source]) -> Li
     if str(options.model) == DEFAULT:
         log(f"encoder: {DEFAULT} (name another with --model)")
     encoder = load_encoder(options.model)
-    head = None if options.head is None else load_head(options.head)
+    head = inputs.head_in_use(options.model, options.head)
     if head is not None:
         head.check(encoder.source, encoder.fingerprint, head.pooling, 1)
     # Live touch is compared with the first features that are shown.

@@ -38,6 +38,10 @@ from anytouch_jax.errors import UserError, refuse_forked
 from anytouch_jax.renamed import keywords
 from anytouch_jax.shown import count_of, described, leaves
 
+# Touches at once up to which onnxruntime is faster than XLA (`experiments.benchmarks.batches`). An
+# engine fuses a small network into fewer calls, and XLA has the faster products of large matrices.
+FEW = 4
+
 
 @dataclass(frozen=True, repr=False)
 class Encoder(Towers):
@@ -252,7 +256,9 @@ class Encoder(Towers):
             )
         arrays.check_frames(self.config.model, frames.shape[1])
         check_choices(pooling, aggregation)
-        run = self.exported(frames.shape[1], pooling) if len(frames) else None
+        run = None
+        if len(frames) and self.uses_engine(len(frames)):
+            run = self.exported(frames.shape[1], pooling)
         if run is not None:
             return run(frames, self._rows(sensor, len(frames)))
         return self._encode(
@@ -264,6 +270,13 @@ class Encoder(Towers):
         return arrays.rows_of_sensors(
             sensor, count, self.sensor_row, len(self.config.model.sensors)
         )
+
+    def uses_engine(self, count: int) -> bool:
+        """Return whether `count` touches at once are computed by an engine, where there is one.
+
+        "auto" leaves more than FEW to XLA, and an engine that was named computes all.
+        """
+        return self.engine not in ("xla", "auto") or (self.engine == "auto" and count <= FEW)
 
     def exported(self, frames: int, pooling: Pooling = "class", *, fields: bool = False) -> Any:
         """Return the export on its engine for touches of `frames` frames.
@@ -395,7 +408,7 @@ class Encoder(Towers):
             aspect: (B,), logarithms of the images' height over width.
             pooling: that of the features.
         """
-        if self.measures:
+        if self.measures and self.uses_engine(len(clips)):
             run = self.exported(clips.shape[1], pooling, fields=True)
             if run is not None:
                 return run.measure(np.asarray(clips), np.asarray(rows), np.asarray(aspect))

@@ -180,6 +180,8 @@ class CalibrationRows(NamedTuple):
         sensors: (N,), sensors of all rows.
         fit: row numbers.
         val: row numbers.
+        tuned: the encoder was trained on the rows of `fit`, whose features are thus no sample of
+            those to come.
     """
 
     logits: Array
@@ -190,6 +192,7 @@ class CalibrationRows(NamedTuple):
     sensors: Array
     fit: Array
     val: Array
+    tuned: bool = False
 
 
 def calibrate(
@@ -226,27 +229,55 @@ def calibrate(
     # and Wasserman (2019): every class whose score is at most the limit.
     set_limit = conformal_limit(1 - p[np.arange(len(truth)), truth], held_out, coverage)
 
+    limits = {"temperature": temperature, "coverage": coverage, "set_limit": set_limit}
+    return Calibration(
+        recordings=len(np.unique(held_out)), **limits, **known_touches(rows, x, false_alarms)
+    )
+
+
+def calibrate_number(
+    rows: CalibrationRows, x: Array, *, coverage: float, false_alarms: float
+) -> Calibration:
+    """Return the calibration of a head of numbers, whose `set_limit` is half of an interval.
+
+    The errors of held-out groups are the scores of split conformal prediction (Lei et al.,
+    "Distribution-free predictive inference for regression", 2018).
+
+    Args:
+        rows: `logits` (n, 1) are predictions, and `y` f64 (n,) the truth.
+        x: f32 (N, d), `rows.features` scaled as the head does.
+        coverage: the probability with which an interval shall hold the truth.
+        false_alarms: the probability with which a known touch may be called novel.
+    """
+    errors = np.abs(rows.logits[:, 0] - rows.y)
+    half = conformal_limit(errors, rows.held_out, coverage)
+    limits = {"temperature": 1.0, "coverage": coverage, "set_limit": half}
+    return Calibration(
+        recordings=len(np.unique(rows.held_out)), **limits, **known_touches(rows, x, false_alarms)
+    )
+
+
+def known_touches(rows: CalibrationRows, x: Array, false_alarms: float) -> dict[str, Any]:
+    """Return the fields of a calibration that tell new touches from known ones.
+
+    `x` f32 (N, d) are the scaled features.
+    """
     fit_groups = rows.groups[rows.fit]
     owners = rows.groups[rows.val]
     whitening, chosen, references = reference_space(x[rows.fit], fit_groups)
     scores = novelty_scores(x[rows.val] @ whitening, references, owners, fit_groups[chosen])
     # Fewer than five groups are expected above the limit, so it would be noise. Rows of `fit` help,
     # if each is scored by groups that it does not belong to.
-    if len(np.unique(owners)) * false_alarms < 5:
+    if len(np.unique(owners)) * false_alarms < 5 and not rows.tuned:
         scores = np.concatenate([scores, left_out_scores(x[rows.fit], fit_groups)])
         owners = np.concatenate([owners, fit_groups])
-    novelty_limit = conformal_limit(scores, owners, 1 - false_alarms)
-    return Calibration(
-        temperature=temperature,
-        coverage=coverage,
-        set_limit=set_limit,
-        false_alarms=false_alarms,
-        novelty_limit=novelty_limit,
-        recordings=len(np.unique(held_out)),
-        whitening=whitening,
-        references=references,
-        sensors=rows.sensors[rows.fit[chosen]],
-    )
+    return {
+        "false_alarms": false_alarms,
+        "novelty_limit": conformal_limit(scores, owners, 1 - false_alarms),
+        "whitening": whitening,
+        "references": references,
+        "sensors": rows.sensors[rows.fit[chosen]],
+    }
 
 
 def probabilities(logits: Array, temperature: float = 1.0) -> Array:

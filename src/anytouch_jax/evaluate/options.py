@@ -26,7 +26,8 @@ class ProbeOptions:
 
     Attributes:
         features: .npz files with features of other encoders, as `anytouch embed` writes them.
-        controls: also probe raw pixels and a random encoder.
+        controls: also probe raw pixels, a random encoder, and an ImageNet network if its package is
+            installed.
         cache: folder that keeps features by content, so that each frame is encoded once.
         out: file for the results as JSON.
         seeds: bootstraps of the train groups (a label), or random splits of the groups (tasks).

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +16,11 @@ from anytouch_jax.encoder.encoder import Encoder, check_frames, load_encoder, ra
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import feature_cache
 from anytouch_jax.evaluate.feature_cache import Encoding, FeatureSource
-from anytouch_jax.evaluate.statistics import RANDOM, RAW
+from anytouch_jax.evaluate.statistics import IMAGENET, RANDOM, RAW
 from anytouch_jax.evaluate.tasks import TaskRows
+from anytouch_jax.weights import registry
 
+_IMAGENET_NAME = "efficientnet_lite0"
 Opened = Sequence[Encoder | FeatureSource]
 
 
@@ -70,11 +73,24 @@ def _pixel_source(table: Manifest, models: Opened, encoding: Encoding) -> Featur
     return FeatureSource(RAW, store, None, "common", is_control=True)
 
 
+def _imagenet_source(table: Manifest, models: Opened, encoding: Encoding) -> FeatureSource | None:
+    """Return an ImageNet network off the shelf, None where its package is not installed."""
+    if not registry.is_installed(_IMAGENET_NAME):
+        return None
+    encoder = load_encoder(_IMAGENET_NAME)
+    # It has one kind of feature, so all poolings share what is stored.
+    encoding = replace(encoding, pooling="class")
+    store = feature_cache.encoder_features(encoder, table, encoding)
+    return FeatureSource(IMAGENET, store, encoder, is_control=True)
+
+
 # What a user would compare with, by name. A row adds a control to every probe: a function from
-# the manifest, the opened models and the encoding to a source with `is_control`.
-CONTROLS: dict[str, Callable[[Manifest, Opened, Encoding], FeatureSource]] = {
+# the manifest, the opened models and the encoding to a source with `is_control`, or to None where
+# it cannot be had.
+CONTROLS: dict[str, Callable[[Manifest, Opened, Encoding], FeatureSource | None]] = {
     RANDOM: _random_source,
     RAW: _pixel_source,
+    IMAGENET: _imagenet_source,
 }
 
 
@@ -109,9 +125,10 @@ def gather_sources(
         check_frames(encoder.config.model, least)
         store = feature_cache.encoder_features(encoder, table, encoding)
         several.append(FeatureSource(name, store, encoder))
-    others = []
+    others = list[FeatureSource]()
     if controls:
-        others = [make(table, models, encoding) for make in CONTROLS.values()]
+        made = [make(table, models, encoding) for make in CONTROLS.values()]
+        others = [one for one in made if one is not None]
     for control in others:
         if control.encoder is not None:
             check_frames(control.encoder.config.model, least)

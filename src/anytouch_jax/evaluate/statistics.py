@@ -23,6 +23,7 @@ Metric = Callable[[Array], Array]
 # the controls of probes
 RAW = "raw pixels"
 RANDOM = "random encoder"
+IMAGENET = "ImageNet network"  # where its package is installed, see `weights.registry.INSTALLED`
 
 # Bootstraps of an interval. Its ends are 0.03 standard errors off; a tenth of the draws gives 0.09.
 DRAWS = 10_000

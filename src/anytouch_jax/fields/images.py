@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from anytouch_jax.data.background.estimate import without_islands
 from anytouch_jax.encoder.arrays import Array
 from anytouch_jax.encoder.measured import Fields
 from anytouch_jax.fields.outputs import LENGTH
@@ -45,7 +46,7 @@ def overlay(frame: Array, measured: Fields, row: int = 0, *, text: bool = True) 
     colours = cv2.cvtColor(cv2.applyColorMap(level, cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB)
     weight = np.minimum(level, 64) * (_OPAQUE / 64)
     view = cv2.blendLinear(np.ascontiguousarray(frame), colours, 1 - weight, weight)
-    inside = (one.contact[0] > 0.5).astype(np.uint8)
+    inside = without_islands((one.contact[0] > 0.5).astype(np.uint8))
     rims = cv2.findContours(inside, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
     cv2.drawContours(view, rims, -1, _WHITE, 1, cv2.LINE_AA)
     _draw_shear(view, one, inside)

@@ -28,6 +28,7 @@ from anytouch_jax.ops import losses
 from anytouch_jax.renamed import keywords
 from anytouch_jax.weights.tree import nest
 from anytouch_jax.zoo import families
+from anytouch_jax.zoo.efficientnet import ConvEncoder, ConvModel, conv_encoder
 from anytouch_jax.zoo.families import Family, FamilyModel, Preparation, Size
 
 Params = dict[str, Any]
@@ -395,11 +396,15 @@ def _resized(image: np.ndarray, size: Size, kernel: str) -> np.ndarray:
     )
 
 
-def family_encoder(model: FamilyModel, source: str, path: Path) -> FamilyEncoder:
+def family_encoder(
+    model: FamilyModel | ConvModel, source: str, path: Path
+) -> FamilyEncoder | ConvEncoder:
     """Return the encoder of what a file of a family has.
 
     SITR's calibration images may be next to it.
     """
+    if isinstance(model, ConvModel):
+        return conv_encoder(model, source)
     background = model.preparation.background
     encoder = FamilyEncoder(
         Config(model.form.model, data=DataConfig(background=background)),
@@ -417,8 +422,10 @@ def family_encoder(model: FamilyModel, source: str, path: Path) -> FamilyEncoder
     return encoder
 
 
-def describe_family(encoder: FamilyEncoder) -> list[str]:
+def describe_family(encoder: FamilyEncoder | ConvEncoder) -> list[str]:
     """Return lines about a family's encoder: size, licence, sensors, input."""
+    if isinstance(encoder, ConvEncoder):
+        return [f"{name}: {value}" for name, value in encoder.about().items()]
     form = encoder.form
     steps = encoder.preparation
     (high, wide) = encoder.image_size

@@ -129,6 +129,16 @@ _HF_VIT: dict[str, Any] = {
     "eps": 1e-12,
     "resample": "bicubic",
 }
+# A network of convolutions, which has a reader of its own (`zoo.efficientnet`).
+CONVOLUTIONAL = Family(
+    name="efficientnet",
+    title="EfficientNet-lite of ImageNet",
+    licence=_APACHE,
+    sensors=IMAGES,
+    table=(),
+    needs=("_conv_stem.weight",),
+    preparation=Preparation("either"),
+)
 FAMILIES = (
     *(
         Family(

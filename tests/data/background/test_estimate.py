@@ -8,6 +8,7 @@ from anytouch_jax.data.background.estimate import (
     background_of_unit,
     estimate_background_image,
     scale_image,
+    without_islands,
 )
 
 SHAPES = "ball", "bar", "pins"
@@ -111,3 +112,23 @@ def test_images_of_other_proportions_are_refused():
             gel.score(frame)
     with pytest.raises(ValueError, match="thin"):
         UntouchedBackground(np.zeros((6, 160, 3), np.uint8)).score(np.zeros((6, 160, 3), np.uint8))
+
+
+def test_islands_at_the_border_are_not_contact() -> None:
+    """The largest part stays, small ones at the border and specks go, others stay."""
+    mask = np.zeros((100, 120), np.uint8)
+    mask[30:60, 30:70] = 1  # contact, 1200 pixels
+    mask[0:5, 0:8] = 1  # an island in a corner
+    mask[80, 60] = 1  # a speck
+    kept = mask.copy()
+    kept[0:5, 0:8] = 0
+    kept[80, 60] = 0
+    mask[80:88, 20:28] = kept[80:88, 20:28] = 1  # a second contact, away from the border
+    mask[40:60, 112:120] = kept[40:60, 112:120] = 1  # a larger one that the border cuts
+    np.testing.assert_array_equal(without_islands(mask), kept)
+    assert without_islands(mask > 0).dtype == bool
+    # one part alone is contact wherever it lies
+    alone = np.zeros_like(mask)
+    alone[:4, :4] = 1
+    np.testing.assert_array_equal(without_islands(alone), alone)
+    assert not without_islands(np.zeros_like(mask)).any()

@@ -29,6 +29,8 @@ from anytouch_jax.live.page.live import Live
 CHROMIUM = shutil.which("chromium")
 AXE = Path(sys.prefix) / "node_modules" / "axe-core" / "axe.min.js"
 SIGNS = "of 2 touches", "Click a point", "Teach it a touch", "What do you want"  # of each tab
+# a surface is turned by keys
+SURFACE = ".stage canvas[tabindex='0']"
 FRAMES = "Number(document.getElementById('main').dataset.frames)"
 pytestmark = pytest.mark.skipif(
     CHROMIUM is None, reason="there is no Chromium: apt-get install chromium"
@@ -162,7 +164,7 @@ def test_touches_are_filtered_and_played(browse):
 def test_a_surface_is_turned(browse):
     page = browse(0)
     page.get_by_role("button", name="Surface").click()
-    page.wait_for_selector("text=times as high")
+    page.wait_for_selector(SURFACE)
     canvas = page.locator(".stage canvas").first
     seen = set()
     seen.add(canvas.evaluate("canvas => canvas.toDataURL()"))
@@ -324,7 +326,7 @@ def test_everybody_can_use_it(browse, theme):
         page.wait_for_selector(f"text={sign}")
         if tab == 0:
             page.get_by_role("button", name="Surface").click()
-            page.wait_for_selector("text=times as high")
+            page.wait_for_selector(SURFACE)
         page.evaluate("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
         page.wait_for_timeout(1000)
         page.evaluate(AXE.read_text())

@@ -145,6 +145,9 @@ def test_live_touch_is_measured(encoder, tmp_path, monkeypatch):
 
     try:
         free, _ = until("depth", lambda about: about["frame"] > 3)
+        # a page that shows fewer pixels gets no more
+        _, small = opened(runner.run(anext(live.packets("depth", 90))))
+        assert max(cv2.imdecode(np.frombuffer(small, np.uint8), cv2.IMREAD_COLOR).shape) == 90
         live.frames.capture_background()
         camera.shape = "ball"
         for layer, shape in (("depth", (360, 480, 3)), ("surface", (54, 72, 3))):

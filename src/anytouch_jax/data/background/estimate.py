@@ -35,6 +35,9 @@ DIFFERENT = 6.5
 # least excess of structure, as a fraction of the sum; measured on real and simulated recordings
 MARGIN = 0.1
 
+# of the largest part of contact, and of the picture: less than that is noise
+_ISLAND = 0.1
+_SPECK = 2e-4
 _FITTING = 0.6  # fraction of the cells that a change of light is fitted to
 _AT = (np.arange(FIT, dtype=np.float32) + 0.5) / FIT - 0.5
 # The terms 1, x and y of a plane, in each cell.
@@ -277,6 +280,30 @@ def _least_excess(centre: np.ndarray, centres: Sequence[np.ndarray], enough: flo
 
 def _distance(frame: np.ndarray, other: np.ndarray, blur: float = BLUR) -> float:
     return contact_score(difference_image(frame, other, blur), round(EDGE * blur / BLUR))
+
+
+def without_islands(mask: np.ndarray) -> np.ndarray:
+    """Return a mask of contact u8 or bool (h, w) without what is noise to the eye.
+
+    The largest part stays. Others go if they are less than a tenth of it and lie at the border,
+    where gels curl and lenses blur, or if they are specks.
+    """
+    count, labels, about, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
+    if count <= 2:
+        return mask
+    area = about[:, cv2.CC_STAT_AREA].astype(np.float64)
+    area[0] = 0.0  # what is not contact
+    left = about[:, cv2.CC_STAT_LEFT]
+    top = about[:, cv2.CC_STAT_TOP]
+    right = left + about[:, cv2.CC_STAT_WIDTH]
+    bottom = top + about[:, cv2.CC_STAT_HEIGHT]
+    height, width = mask.shape
+    at_border = (left == 0) | (top == 0) | (right == width) | (bottom == height)
+    small = area < _ISLAND * area.max()
+    keep = ~(small & at_border) & (area >= _SPECK * mask.size)
+    keep[int(np.argmax(area))] = True
+    keep[0] = False
+    return keep[labels].astype(mask.dtype)
 
 
 def contact_score(difference: np.ndarray, edge: int = EDGE) -> float:

@@ -17,7 +17,7 @@ from anytouch_jax.live.page.setup import Setup, make_setup, measure_last
 if TYPE_CHECKING:
     from anytouch_jax.data.transforms import Flip
     from anytouch_jax.encoder.encoder import Encoder
-    from anytouch_jax.encoder.linear_head import LinearHead
+    from anytouch_jax.encoder.linear_head import Head
     from anytouch_jax.encoder.measured import Fields
 
 _LAST = 8  # frames that are kept: a clip, and those that are read while it is embedded
@@ -47,7 +47,7 @@ class FrameReader:
         self,
         encoder: Encoder,
         sensor: str,
-        head: Callable[[], LinearHead | None],
+        head: Callable[[], Head | None],
         log: Callable[[str], None],
     ) -> None:
         self.threshold = THRESHOLDS.get(sensor, DEFAULT_THRESHOLD)

@@ -8,7 +8,12 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
-from anytouch_jax.data.background.estimate import UntouchedBackground, contact_score, scale_image
+from anytouch_jax.data.background.estimate import (
+    UntouchedBackground,
+    contact_score,
+    scale_image,
+    without_islands,
+)
 from anytouch_jax.data.transforms import subtract_background
 from anytouch_jax.encoder.arrays import Array
 from anytouch_jax.errors import UserError
@@ -67,7 +72,7 @@ def touch_layer(
             background = cv2.resize(background, (width, height))
         (view,) = subtract_background([view], background)
     elif name == "contact":
-        mask = (cv2.resize(change, (width, height)) > limit).astype(np.uint8)
+        mask = without_islands((cv2.resize(change, (width, height)) > limit).astype(np.uint8))
         tinted = cv2.LUT(view, _TINTED)
         view = cv2.convertScaleAbs(view, alpha=1 / 3, beta=40)
         cv2.copyTo(tinted, mask, view)

@@ -16,8 +16,10 @@ from anytouch_jax.encoder.arrays import Array
 from anytouch_jax.live.page.layers import (
     LAYERS,
     MEASURED,
+    SIDE,
     field_numbers,
     measured_layer,
+    scale_down,
     touch_layer,
 )
 
@@ -74,8 +76,12 @@ def describe_touch(score: float, threshold: float, fields: Fields | None) -> dic
     }
 
 
-def packet(shown: Shown, layer: str) -> bytes:
-    """Return a frame for the page: length u32, JSON, length u32, JPEG, little endian."""
+def packet(shown: Shown, layer: str, side: int = SIDE) -> bytes:
+    """Return a frame for the page: length u32, JSON, length u32, JPEG, little endian.
+
+    The long side of the picture has at most `side` pixels: as many as the page shows, because the
+    browser has to decode each of them.
+    """
     about = {"layer": layer, "sent": 1e3 * time.time(), **shown.about}
     jpeg = b""
     if shown.image is not None:
@@ -86,6 +92,6 @@ def packet(shown: Shown, layer: str) -> bytes:
             about["layer"] = LAYERS[0]
         elif layer in MEASURED and shown.fields is not None:
             view = measured_layer(view, shown.fields, layer)
-        jpeg = encode(view, ".jpg", cv2.IMWRITE_JPEG_QUALITY, _QUALITY)
+        jpeg = encode(scale_down(view, side), ".jpg", cv2.IMWRITE_JPEG_QUALITY, _QUALITY)
     text = json.dumps(about).encode()
     return struct.pack("<I", len(text)) + text + struct.pack("<I", len(jpeg)) + jpeg

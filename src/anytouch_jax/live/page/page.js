@@ -274,7 +274,7 @@ function clipCard(source, clip, pictures, title) {
   const show = async (t) => {
     for (let next = t + 1; next <= Math.min(t + AHEAD, clip.rows.length - 1); next++) pictures.get(clip.rows[next]);
     const one = await load(t), score = one.score ?? null;
-    if (one.bitmap) showLayer(canvas, one.bitmap, one.isSurface);
+    if (one.bitmap) showLayer(canvas, one.bitmap, one.isSurface ? one.fields : null);
     force.show(one.fields, one.isSurface ? "surface" : state.layer);
     contact.textContent = one.error ?? (score === null ? (clip.rows.length > 1 ? "\u00a0" : "") : score > clip.threshold ? "● contact" : "○ no contact");
   };

@@ -48,8 +48,14 @@ if TYPE_CHECKING:
 LOCAL = ("127.0.0.1", "localhost", "::1")
 # of every request that changes something: another site would need CORS to send it
 HEADER = "x-anytouch"
+SMALLEST = 64  # pixels of the long side of a live picture
 _SCRIPTS = ("page.js", "fields.js", "space.js", "live.js")
-_ASSETS = {"": "text/html", "page.css": "text/css"} | dict.fromkeys(_SCRIPTS, "text/javascript")
+_SHARED = "theme.css"  # with reports, so it lies in the package's root
+_ASSETS = (
+    {"": "text/html"}
+    | dict.fromkeys((_SHARED, "page.css"), "text/css")
+    | dict.fromkeys(_SCRIPTS, "text/javascript")
+)
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' "
     "blob: data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -225,7 +231,8 @@ def _asset(request: Request) -> Response:
     name = request.path_params.get("name", "")
     if name not in _ASSETS:
         return Response("not found", 404, _SAFE)
-    data = (files("anytouch_jax.live.page") / (name or "page.html")).read_bytes()
+    folder = files("anytouch_jax" if name == _SHARED else "anytouch_jax.live.page")
+    data = (folder / (name or "page.html")).read_bytes()
     headers = _SAFE | {"Cache-Control": "no-cache"}
     return Response(data, media_type=_ASSETS[name], headers=headers)
 
@@ -287,7 +294,10 @@ def _figure(request: Request, run: Run) -> Response:
 
 
 def _stream(request: Request, live: Live) -> Response:
-    packets = live.packets(_layer(request))
+    side = SIDE
+    if "side" in request.query_params:
+        side = max(SMALLEST, min(SIDE, _number(request, "side")))
+    packets = live.packets(_layer(request), side)
     return StreamingResponse(packets, media_type="application/octet-stream", headers=_SAFE)
 
 
@@ -440,6 +450,10 @@ def _control(live: Live, order: Any) -> None:
         live.teacher.reload()
     elif action == "train":
         live.teacher.train()
+    elif action == "train longer":
+        live.teacher.train_longer()
+    elif action == "keep the best":
+        live.teacher.longer.stop()
     elif action == "leave out" and isinstance(sequence, str):
         live.teacher.leave_out(sequence)
     else:

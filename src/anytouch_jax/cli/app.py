@@ -138,7 +138,7 @@ COMMANDS = {
         "Probe a public benchmark with the authors' settings.",
     ),
     "finetune": Command(
-        "finetune:FinetuneOptions",
+        "finetune:TuningOptions",
         "finetune:run",
         "Train the encoder and a head on your labels, in minutes.",
     ),

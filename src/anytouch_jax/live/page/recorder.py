@@ -20,6 +20,7 @@ from anytouch_jax.data.manifest.schema import EMPTY
 from anytouch_jax.encoder.arrays import Array
 from anytouch_jax.encoder.sensor_words import resolve_sensor
 from anytouch_jax.errors import UserError
+from anytouch_jax.files import read_arrays
 from anytouch_jax.live.page.shared import SharedManifest
 
 SCORE = "label.contact_score"
@@ -33,6 +34,15 @@ class _Recorded(NamedTuple):
     image: Array
     score: float
     values: Array
+
+
+def _sensors_of(features: Path) -> set[str]:
+    """Return the sensors of a features file, none for one that is missing or damaged."""
+    try:
+        arrays = read_arrays(features, only="key/sensor".__eq__)
+    except (OSError, ValueError):
+        return set()
+    return set(arrays["key/sensor"].tolist()) if "key/sensor" in arrays else set()
 
 
 class LiveRecorder:
@@ -57,6 +67,17 @@ class LiveRecorder:
         self._lost = 0
         self._name = ""
         self._done = ""
+
+    def head_files(self) -> tuple[Path, Path]:
+        """Return the files of a head on the recordings, and of its features.
+
+        They are head.npz and features.npz, or head_SENSOR.npz and so on beside those of another
+        sensor: two pages on different sensors may share the folder.
+        """
+        features = self.out / "features.npz"
+        if _sensors_of(features) - {self.sensor}:
+            return self.out / f"head_{self.sensor}.npz", self.out / f"features_{self.sensor}.npz"
+        return self.out / "head.npz", features
 
     def state(self) -> dict[str, Any]:
         """Return the state for the page."""

@@ -65,7 +65,7 @@ class ContainerError(UserError):
     """A file of arrays that cannot be read; the message names it."""
 
 
-class Form(NamedTuple):
+class FrameForm(NamedTuple):
     """How an array holds frames."""
 
     frames: int
@@ -87,7 +87,7 @@ class ArrayInfo(NamedTuple):
     key: str
     shape: tuple[int, ...]
     dtype: str
-    form: Form | None
+    form: FrameForm | None
 
 
 class Stored(Protocol):
@@ -239,7 +239,7 @@ def stack_rows(path: Path) -> dict[str, list[Path]] | None:
     }
 
 
-def _stacks_among(forms: dict[str, Form], names: Collection[str]) -> dict[str, Form]:
+def _stacks_among(forms: dict[str, FrameForm], names: Collection[str]) -> dict[str, FrameForm]:
     """Return which arrays of a NumPy file are the frames, among those that could be some.
 
     Maps of depth, without channels, lie beside frames with channels, and rows of features or
@@ -357,7 +357,7 @@ def _type_name(stored: Stored) -> str:
     return "bytes" if stored.dtype.kind in "OSVT" else str(stored.dtype)
 
 
-def _form_of(stored: Stored, is_mixed: bool) -> Form | None:
+def _form_of(stored: Stored, is_mixed: bool) -> FrameForm | None:
     """Return how an array holds frames, None if it holds none.
 
     Where other arrays lie beside it (`is_mixed`), sides below 8 pixels are those of a vector or a
@@ -382,22 +382,22 @@ def _form_of(stored: Stored, is_mixed: bool) -> Form | None:
         if one is not None and (is_mixed or one.layout == "HWC"):
             return one._replace(single=True)
         if min(shape[1:]) >= least and (stored.dtype.kind == "u" or not is_mixed):
-            return Form(shape[0], "HW", shape[1], shape[2])
+            return FrameForm(shape[0], "HW", shape[1], shape[2])
     if len(shape) == 2 and min(shape) >= least and (is_bytes or not is_mixed):
-        return Form(1, "HW", shape[0], shape[1], single=True)
+        return FrameForm(1, "HW", shape[0], shape[1], single=True)
     return None
 
 
-def _frames_form(sides: tuple[int, ...], frames: int, least: int) -> Form | None:
+def _frames_form(sides: tuple[int, ...], frames: int, least: int) -> FrameForm | None:
     """Return the form of images with three sides of `least` pixels, channels last or first."""
     if sides[2] in _CHANNELS and min(sides[:2]) >= least:
-        return Form(frames, "HWC", sides[0], sides[1])
+        return FrameForm(frames, "HWC", sides[0], sides[1])
     if sides[0] in _CHANNELS and min(sides[1:]) >= least:
-        return Form(frames, "CHW", sides[1], sides[2])
+        return FrameForm(frames, "CHW", sides[1], sides[2])
     return None
 
 
-def _form_of_files(stored: Stored, shape: tuple[int, ...], *, is_vector: bool) -> Form | None:
+def _form_of_files(stored: Stored, shape: tuple[int, ...], *, is_vector: bool) -> FrameForm | None:
     """Return the form of JPEG and PNG files: values of a varying length, or padded rows of u8."""
     axes = len(shape) - is_vector
     if axes not in (0, 1):
@@ -408,7 +408,7 @@ def _form_of_files(stored: Stored, shape: tuple[int, ...], *, is_vector: bool) -
         return None
     if not first.startswith(_IMAGE_STARTS):
         return None
-    return Form(shape[0] if axes else 1, "files", single=not axes)
+    return FrameForm(shape[0] if axes else 1, "files", single=not axes)
 
 
 def file_bytes(value: Any) -> bytes:

@@ -56,8 +56,6 @@ class Fields:
     contact: Array
     force: Array | None
     force_std: Array | None
-    force_low: Array | None
-    force_high: Array | None
     torque: Array | None
     torque_std: Array | None
     slip: Array
@@ -70,6 +68,8 @@ class Fields:
     shape: float
     faults: tuple[str, ...] = ()
     case: str = "unknown"
+    force_low: Array | None = None
+    force_high: Array | None = None
 
     def __len__(self) -> int:
         return len(self.depth)

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from anytouch_jax.data import containers
-from anytouch_jax.data.containers import ArrayInfo, Container, ContainerError, Form
+from anytouch_jax.data.containers import ArrayInfo, Container, ContainerError, FrameForm
 from anytouch_jax.data.manifest.schema import listed
 from anytouch_jax.data.names import natural
 from anytouch_jax.datasets.readers import common
@@ -60,7 +60,7 @@ class CameraArrays(NamedTuple):
     """
 
     key: str
-    form: Form
+    form: FrameForm
     dtype: str
     frames: list[tuple[int, str, int]]
     background: tuple[str, int] | None = None
@@ -215,7 +215,7 @@ def _cameras(images: Sequence[ArrayInfo], place: str) -> list[CameraArrays]:
     ]
 
 
-def _form_of(one: ArrayInfo) -> Form:
+def _form_of(one: ArrayInfo) -> FrameForm:
     if one.form is None:  # of no image
         raise DatasetError(f"{one.key} holds no images")
     return one.form

@@ -227,7 +227,7 @@ def fit(seed: int) -> None:
     rows = []
     states = []
     for state, before, after in pairs(_FITTED, 1, 1000 + seed, _NOISES):
-        rows.append(condition.features_of(before, after))
+        rows.append(condition.change_features(before, after))
         states.append(condition.STATES.index(state))
     values = np.array(rows)
     mean, scale = values.mean(0), values.std(0)

@@ -67,7 +67,7 @@ def _stored(options: CheckOptions) -> np.ndarray:
 
 def _today(path: Path) -> np.ndarray:
     """Return the image of today: of several frames the median, which has less noise."""
-    from anytouch_jax.cli.inputs import some_frames
+    from anytouch_jax.cli.frame_files import some_frames
     from anytouch_jax.data.background.rule import alike, median, reduced
 
     if not path.exists():

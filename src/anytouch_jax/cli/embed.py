@@ -7,17 +7,18 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
+from anytouch_jax.cli.frame_files import count_frames
+from anytouch_jax.cli.frame_files import log_if_cut as log_if_cut
+from anytouch_jax.cli.frame_files import numbered_frames as numbered_frames
 from anytouch_jax.cli.inputs import FrameOptions as FrameOptions
-from anytouch_jax.cli.inputs import FramesInput, Inputs, count_frames
+from anytouch_jax.cli.inputs import FramesInput, Inputs
 from anytouch_jax.cli.inputs import SensorOptions as SensorOptions
 from anytouch_jax.cli.inputs import backgrounds_of as backgrounds_of
 from anytouch_jax.cli.inputs import choose_gel as choose_gel
 from anytouch_jax.cli.inputs import contact_of_rows as contact_of_rows
 from anytouch_jax.cli.inputs import frames_input as frames_input
 from anytouch_jax.cli.inputs import load_inputs as load_inputs
-from anytouch_jax.cli.inputs import log_if_cut as log_if_cut
 from anytouch_jax.cli.inputs import log_universal as log_universal
-from anytouch_jax.cli.inputs import numbered_frames as numbered_frames
 from anytouch_jax.cli.inputs import takes_manifest as takes_manifest
 from anytouch_jax.cli.inputs import usable_rows as usable_rows
 from anytouch_jax.cli.output import check_folder, log, refuse_unused

@@ -11,7 +11,7 @@ from itertools import groupby, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from anytouch_jax.cli import inputs
+from anytouch_jax.cli import frame_files, inputs
 from anytouch_jax.cli.output import check_apart, check_folder, log
 from anytouch_jax.config.parsing import Above0
 from anytouch_jax.errors import UserError, handled
@@ -258,7 +258,7 @@ def _of_frames(encoder: Encoder, options: MeasureOptions) -> Iterator[_Touch]:
     ring = list[np.ndarray]()
     last = -1
     for number, name, frame in tracked(
-        inputs.numbered_frames(data, "error", times), "frames measured", inputs.count_frames(data)
+        frame_files.numbered_frames(data, "error", times), "frames measured", frame_files.count_frames(data)
     ):
         assert frame is not None  # an unreadable one is an error
         frame = np.ascontiguousarray(orient_frame(frame, options.rotate, options.flip))
@@ -272,7 +272,7 @@ def _of_frames(encoder: Encoder, options: MeasureOptions) -> Iterator[_Touch]:
         frames = np.stack(ring)
         yield _Touch(name or str(number), time, frames, options.sensor or UNIVERSAL, background)
     if times:
-        inputs.log_if_cut(data, len(times))
+        frame_files.log_if_cut(data, len(times))
 
 
 def _of_manifest(encoder: Encoder, options: MeasureOptions, manifest: Manifest) -> Iterator[_Touch]:

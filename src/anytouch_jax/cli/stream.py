@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional
 
-from anytouch_jax.cli import embed, inputs
+from anytouch_jax.cli import embed, frame_files, inputs
 from anytouch_jax.cli.arguments import DEFAULT
 from anytouch_jax.cli.heads import head_in_use
 from anytouch_jax.cli.output import check_folder, log, refuse_unused
@@ -170,7 +170,7 @@ def _check_video(options: StreamOptions, result: Result) -> None:
             f"{options.data} has too few frames for a clip of {options.frames} at stride "
             f"{options.stride}. Lower one of them."
         )
-    inputs.log_if_cut(Path(options.data), int(result.numbers[-1]) + 1)
+    frame_files.log_if_cut(Path(options.data), int(result.numbers[-1]) + 1)
 
 
 def _log_rate(result: Result, nominal: float) -> None:

@@ -31,7 +31,7 @@ from anytouch_jax.encoder.arrays import Array
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_write, check_array, read_arrays
 from anytouch_jax.sim.fitting.balls import (
-    grid_of,
+    pixel_grid,
     normals_of,
     place_balls,
     usual_strength,
@@ -265,7 +265,7 @@ def _deepest_around(depth: Array, reach: float, shape: float) -> Array:
 @lru_cache(maxsize=4)
 def _places(shape: tuple[int, ...]) -> tuple[Array, Array]:
     """Return the places -1 to 1 of pixels, f32 (h * w,) each."""
-    grid = grid_of(shape, 1.0)
+    grid = pixel_grid(shape, 1.0)
     return grid.u.ravel().astype(np.float32), grid.v.ravel().astype(np.float32)
 
 
@@ -497,7 +497,7 @@ class _Presses:
         self._width_mm = width_mm
         self._radius = radius
         self._contacts = poses[:, 2]
-        grid = grid_of(changes.shape[1:3], width_mm)
+        grid = pixel_grid(changes.shape[1:3], width_mm)
         self._away = [np.hypot(grid.x - x, grid.y - y) for x, y, _ in poses]
         rows = [_features(change).T.astype(np.float64) for change in changes]
         self._normal = [

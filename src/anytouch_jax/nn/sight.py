@@ -219,7 +219,7 @@ def _depthwise_backward(
         edges.append((side - 1 - before, after, stride - 1))
     zero = jnp.zeros((), gradient.dtype)
     spread = lax.pad(gradient, zero, [(0, 0, 0), *edges, (0, 0, 0)])
-    to_x = _valid(spread, kernel[::-1, ::-1], x.shape[1:3], 1)
+    to_x = _valid(spread, kernel[::-1, ::-1], (x.shape[1], x.shape[2]), 1)
 
     # Image by image: one sum over the whole batch takes forty times longer on a CPU.
     def add(sums: Array, pair: tuple[Array, Array]) -> tuple[Array, None]:

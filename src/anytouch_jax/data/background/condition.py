@@ -85,7 +85,7 @@ def check_condition(stored: Array, today: Array) -> Condition:
 
     Raises UserError for images of other proportions.
     """
-    values = features_of(stored, today)
+    values = change_features(stored, today)
     with (files("anytouch_jax.data.background") / FILE).open("rb") as file:
         model = _model(file.read())
     logits = model["intercept"] + model["weights"] @ expanded(
@@ -114,7 +114,7 @@ def expanded(values: Array) -> Array:
     return np.concatenate([values, values[..., left] * values[..., right]], -1)
 
 
-def features_of(stored: Array, today: Array) -> Array:
+def change_features(stored: Array, today: Array) -> Array:
     """Return the features f64 (12,) of two images, most of them logarithms of grey levels."""
     if abs(np.log(stored.shape[0] * today.shape[1] / (stored.shape[1] * today.shape[0]))) > _SHAPE:
         raise UserError(

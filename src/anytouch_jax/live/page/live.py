@@ -16,9 +16,8 @@ from anytouch_jax.errors import UserError
 from anytouch_jax.live.cameras import CameraSettings, LoopedVideo, open_source
 from anytouch_jax.live.examples import EXAMPLE, ExampleCamera
 from anytouch_jax.live.page.frames import FrameReader
-from anytouch_jax.live.page.layers import SIDE
 from anytouch_jax.live.page.naming import NearestTouches, name_touch
-from anytouch_jax.live.page.packet import Shown, describe_touch, layers_of, packet
+from anytouch_jax.live.page.packet import SIDE, Shown, describe_touch, layers_of, packet
 from anytouch_jax.live.page.recorder import LiveRecorder
 from anytouch_jax.live.page.teach import Teacher
 from anytouch_jax.live.stream import Embedded, Source, StreamSettings, stream_with

@@ -30,7 +30,7 @@ _USUAL_AT = 0.5  # sine of the tilt up to which the strength of colours is taken
 _LEAST = 0.02  # strength of a gel that shows slopes
 
 
-class Grid(NamedTuple):
+class PixelGrid(NamedTuple):
     """Places of pixels: mm from the middle, and -1 to 1."""
 
     x: Array
@@ -53,14 +53,14 @@ class Balls(NamedTuple):
     strength: float
 
 
-def grid_of(shape: tuple[int, ...], width_mm: float) -> Grid:
+def pixel_grid(shape: tuple[int, ...], width_mm: float) -> PixelGrid:
     """Return the places of square pixels (h, w) of an image that shows `width_mm`."""
     height, width = shape[:2]
     pixel = width_mm / width
     x, y = np.meshgrid(
         (np.arange(width) + 0.5 - width / 2) * pixel, (np.arange(height) + 0.5 - height / 2) * pixel
     )
-    return Grid(x, y, 2 * x / width_mm, 2 * y / (height * pixel))
+    return PixelGrid(x, y, 2 * x / width_mm, 2 * y / (height * pixel))
 
 
 def slope_of(away: Array, contact: float, radius: float) -> Array:
@@ -98,7 +98,7 @@ def depth_of(away: Array, contact: float, radius: float) -> Array:
     return np.asarray(above + np.interp(np.maximum(away / contact, 1), ratio, below))
 
 
-def normals_of(grid: Grid, pose: Array, radius: float) -> tuple[Array, Array]:
+def normals_of(grid: PixelGrid, pose: Array, radius: float) -> tuple[Array, Array]:
     """Return the sines of the tilt along x and y of a ball at a pose, at the places of a grid."""
     dx = grid.x - pose[0]
     dy = grid.y - pose[1]
@@ -108,7 +108,7 @@ def normals_of(grid: Grid, pose: Array, radius: float) -> tuple[Array, Array]:
     return sine * dx, sine * dy
 
 
-def _design(grid: Grid, pose: Array, radius: float) -> Array:
+def _design(grid: PixelGrid, pose: Array, radius: float) -> Array:
     """Return the columns (n, 16) of the linear problem of the colours for a pose."""
     nx, ny = normals_of(grid, pose, radius)
     columns = [nx**i * ny**j for i, j in _POWERS]
@@ -120,7 +120,7 @@ def _design(grid: Grid, pose: Array, radius: float) -> Array:
     return np.stack([*columns, dx * glow, dy * glow, glow], 1)
 
 
-def _first_pose(change: Array, clear: Array, grid: Grid) -> Array:
+def _first_pose(change: Array, clear: Array, grid: PixelGrid) -> Array:
     """Return the middle of the strongest changes, and the radius of their area."""
     strength = np.abs(change).max(-1) * clear
     strong = strength > 0.4 * np.percentile(strength, 99.5)
@@ -132,7 +132,7 @@ def _first_pose(change: Array, clear: Array, grid: Grid) -> Array:
 class _Colours:
     """Colours of some presses, as what is left of them by their poses."""
 
-    def __init__(self, parts: list[tuple[Grid, Array]], radius: float) -> None:
+    def __init__(self, parts: list[tuple[PixelGrid, Array]], radius: float) -> None:
         self._grids = [grid for grid, _ in parts]
         self.changes = np.concatenate([change for _, change in parts])
         self._radius = radius
@@ -171,12 +171,12 @@ def place_balls(change: Array, clear: Array, width_mm: float, ball_mm: float) ->
     size = (max(1, round(width * shrink)), max(1, round(height * shrink)))
     small = [cv2.resize(one, size, interpolation=cv2.INTER_AREA) for one in change]
     shown = [cv2.resize(one.astype(np.float32), size) > 0.5 for one in clear]
-    grid = grid_of(small[0].shape, width_mm)
+    grid = pixel_grid(small[0].shape, width_mm)
     first = np.stack([_first_pose(*one, grid) for one in zip(small, shown, strict=True)])
     parts = []
     for one, seen, pose in zip(small, shown, first, strict=True):
         near = seen & (np.hypot(grid.x - pose[0], grid.y - pose[1]) < _WINDOW * pose[2])
-        parts.append((Grid(*(values[near] for values in grid)), one[near].astype(np.float64)))
+        parts.append((PixelGrid(*(values[near] for values in grid)), one[near].astype(np.float64)))
     colours = _Colours(parts, radius)
     reach = 2 * first[:, 2]
     low = np.stack([first[:, 0] - reach, first[:, 1] - reach, 0 * reach + 0.1 * radius], 1)
@@ -197,7 +197,7 @@ def place_balls(change: Array, clear: Array, width_mm: float, ball_mm: float) ->
     return Balls(poses, explained, _strength(parts, poses, radius))
 
 
-def _strength(parts: list[tuple[Grid, Array]], poses: Array, radius: float) -> float:
+def _strength(parts: list[tuple[PixelGrid, Array]], poses: Array, radius: float) -> float:
     """Return the colour change over the sine of the tilt, root mean squares in the contacts."""
     changes = 0.0
     tilts = 0.0

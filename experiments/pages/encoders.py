@@ -133,8 +133,30 @@ def measure(folder: Path) -> Page:
         )
         for name, one in balls.items()
     ]
+    flats = read_records(folder / "flats.jsonl")
+    objects = [
+        (
+            name,
+            one["deepest"],
+            one["read"],
+            *(100 * one[part] for part in ("filled", "iou", "force_bias", "force", "force_in_2")),
+        )
+        for name, one in flats.items()
+        if "filled" in one
+    ]
+    circles = [
+        (
+            name.removeprefix("another lab's GelSight, read as "),
+            *map(one.get, ("centre_mm", "radius_ratio", "above_rim_mm", "cap_mm")),
+        )
+        for name, one in flats.items()
+        if "cap_mm" in one
+    ]
     low, high = (bound(row[1] for row in rows) for bound in (min, max))
+    studs = flats["studs"]
     findings = [
+        f"A grid of flat studs: the depth in contact is {100 * studs['filled']:.0f} % of the true "
+        f"one, of a coin {100 * flats['coin']['filled']:.0f} %.",
         f"Simulated: depth in contact is off by {low:.2f} to {high:.2f} mm, by sensor.",
         *(
             f"{name}: the radius is off by {100 * one['radius'][0]:.0f} %, the centre by "
@@ -143,7 +165,12 @@ def measure(folder: Path) -> Page:
         ),
     ]
     answer = "On new simulated units the depth in contact is off by this much."
-    return Page("measure", [real, rows, along], findings, (answer, f"{low:.2f} to {high:.2f} mm"))
+    return Page(
+        "measure",
+        [real, circles, rows, objects, along],
+        findings,
+        (answer, f"{low:.2f} to {high:.2f} mm"),
+    )
 
 
 def lookalikes(folder: Path) -> Page:

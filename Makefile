@@ -35,22 +35,11 @@ WEIGHTS    ?= runs/anytouch-tiny
 MINUTES    ?= 12
 ENCODERS   ?=
 
-DEMO       ?= runs/demo
-DEMO_STEPS ?= 200
-DEMO_STEPS1 ?= 400
+DEMO         ?= runs/demo
+DEMO_MINUTES ?= 2
 
 train-stage1: RUN ?= runs/stage1
 train-stage2 probe: RUN ?= runs/stage2
-
-# The demo learns from scratch in minutes on two cores: small towers, contact frames less the untouched gel, and each
-# touch against all others of its batch (experiments/tables/plan.py says why).
-TOWER = $(foreach one,width=128 depth=2 heads=4 mlp=512,--model.$(1).$(subst =, ,$(one)))
-DEMO0 := --preset tiny --model.image-size 84 $(call TOWER,touch) --optim.learning-rate 1e-3 --data.background subtract --data.contact-only --data.jitter 0 0 0 0
-DEMO1 := $(DEMO0) --steps $(DEMO_STEPS1) --batch 48
-# A longer demo lies next to the plain one, on the same scenes: stage1-3000, stage2-3000-600, report-3000-600.
-DEMO_LONGER1 := $(if $(filter-out 400,$(DEMO_STEPS1)),-$(DEMO_STEPS1))
-DEMO_LONGER := $(DEMO_LONGER1)$(if $(DEMO_LONGER1)$(filter-out 200,$(DEMO_STEPS)),-$(DEMO_STEPS))
-DEMO2 := $(DEMO0) $(call TOWER,image) $(call TOWER,text.stack) --steps $(DEMO_STEPS) --batch 64 --model.match-head cosine --objective.match-weight 8 --data.negatives same_sensor
 
 ANYTOUCH := $(PY) -m anytouch_jax
 PYTEST   := $(PY) -m pytest -n $(WORKERS) --dist loadfile
@@ -81,12 +70,8 @@ help: ## list the targets
 
 setup: $(STAMP) ## make .venv with the pinned versions
 
-demo: $(STAMP) ## simulate, train both stages, probe and report, in 4 to 12 minutes: [DEMO= DEMO_STEPS=200, of stage 2, DEMO_STEPS1=400, of stage 1]
-	$(ANYTOUCH) data simulate --out $(DEMO)/scenes --touches 500 --objects 250 --size 128
-	test -e $(DEMO)/scenes/contact.parquet || $(ANYTOUCH) data contact $(DEMO)/scenes/manifest.parquet --share 0.6 --out $(DEMO)/scenes/contact.parquet
-	$(ANYTOUCH) train --stage 1 --data $(DEMO)/scenes/contact.parquet --run $(DEMO)/stage1$(DEMO_LONGER1) $(DEMO1)
-	$(ANYTOUCH) train --stage 2 --data $(DEMO)/scenes/contact.parquet --run $(DEMO)/stage2$(DEMO_LONGER) --init $(DEMO)/stage1$(DEMO_LONGER1) $(DEMO2)
-	$(ANYTOUCH) report --data $(DEMO)/scenes/contact.parquet --stage1 $(DEMO)/stage1$(DEMO_LONGER1) --stage2 $(DEMO)/stage2$(DEMO_LONGER) --out $(DEMO)/report$(DEMO_LONGER)
+demo: $(STAMP) ## a sensor that the encoder has never met learns to name shapes: a page within a minute, the whole below ten: [DEMO= DEMO_MINUTES=2, of each of two trainings]
+	$(PY) -m experiments.demo.run --out $(DEMO) --minutes $(DEMO_MINUTES)
 
 simulate: $(STAMP) ## touch scenes by several sensors: [SCENES=]
 	$(ANYTOUCH) data simulate --out $(SCENES)
@@ -162,10 +147,11 @@ corpus: $(STAMP) ## simulated touches on disk, of which the encoders are asked f
 weights: $(STAMP) ## train an encoder on endless touches for a time, and go on later: [MINUTES=12 REAL="a.csv b.csv" WEIGHTS=runs/anytouch-tiny]
 	$(PY) -m experiments.encoders.train --minutes $(MINUTES) --real $(REAL) --out $(WEIGHTS)
 
-figures: $(STAMP) ## after new weights: measure the shipped encoder, then the results, pictures, notebooks and pages that show it: [TOUCH=manifest of real touch]
+figures: $(STAMP) ## after new weights: measure the shipped encoder, then the results, images, notebooks and pages that show it: [TOUCH=manifest of real touch]
 	$(PY) -m experiments.real.run anytouch-tiny untrained:anytouch-tiny$(if $(TOUCH), --data $(TOUCH))
 	$(PY) -m experiments.real.run anytouch-tiny --untouched median$(if $(TOUCH), --data $(TOUCH))
 	$(PY) -m experiments.encoders.picture docs/pictures/first_touch.png
+	$(PY) -m experiments.encoders.animation docs/pictures/press.webp
 	$(PY) -m experiments.pages
 	$(PY) -m experiments.notebooks.execute 01 02 03 04
 	WRITE_PAGES=1 $(PY) -m pytest tests/laws/test_pages_run.py

@@ -80,7 +80,7 @@ def api_page() -> str:
 def tutorial(notebook: Path, folder: Path) -> str:
     """Return a notebook as a page: its text, its code and what that printed.
 
-    Pictures go to `folder`.
+    Images go to `folder`.
     """
     parts = [_LOW]
     for number, cell in enumerate(json.loads(notebook.read_text(encoding="utf-8"))["cells"]):
@@ -91,9 +91,9 @@ def tutorial(notebook: Path, folder: Path) -> str:
                 # The fence is longer than any in the printed text, so that the text cannot end it.
                 fence = max(["``", *re.findall("`+", printed)], key=len) + "`"
                 parts.append(f"{fence}text\n{printed}\n{fence}")
-            if picture := output.get("data", {}).get("image/png"):
+            if image := output.get("data", {}).get("image/png"):
                 name = f"{notebook.stem}-{number}-{place}.png"
-                (folder / name).write_bytes(base64.b64decode("".join(picture)))
+                (folder / name).write_bytes(base64.b64decode("".join(image)))
                 parts.append(f"![Output of the cell above]({name})")
     return "\n\n".join(parts) + "\n"
 

@@ -92,6 +92,12 @@ def _free_compiled_programs():
         LIBC.malloc_trim(0)
 
 
+@pytest.fixture(autouse=True)
+def _no_other_packages(monkeypatch):
+    """Probes have the same controls whether or not a package with an ImageNet network is there."""
+    monkeypatch.setattr("anytouch_jax.weights.registry.is_installed", lambda name: False)
+
+
 @pytest.fixture(scope="session")
 def world(tmp_path_factory):
     """The manifest of a small world on disk (see runs.py)."""

@@ -4,12 +4,12 @@ import cv2
 import numpy as np
 import pytest
 from checked_world import columns
-from faulty_camera import Film
+from faulty_camera import Video
 from touch_world import make_touches
 
 from anytouch_jax.cli.app import main
 from anytouch_jax.config import DataConfig, preset
-from anytouch_jax.data.background.rule import SETTLED, UnitGels
+from anytouch_jax.data.background.rule import SETTLED, Backgrounds
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.loading.loader import Loader
 from anytouch_jax.data.loading.samples import SampleError, SampleReader, evaluation
@@ -41,7 +41,7 @@ def settings(touches, background="subtract", **data):
         "batch_size": 4,
         "flip": 0.0,
         "jitter": (0.0,) * 4,
-        "clip_share": 0.0,
+        "clip_fraction": 0.0,
         "background": background,
     } | data
     data = DataConfig(manifests=(str(touches),), **data)
@@ -71,16 +71,16 @@ def test_what_is_left_is_the_contact_on_middle_grey():
     assert np.abs(subtract_background([GEL], large)[0].astype(int) - 128).max() <= 1
 
 
-@pytest.mark.parametrize(("stored", "used"), [(True, "a stored picture"), (False, "the median of")])
+@pytest.mark.parametrize(("stored", "used"), [(True, "a stored image"), (False, "the median of")])
 def test_training_and_probes_read_the_same_differences(touches, stored, used):
     table = manifests.read(touches)
     if not stored:
         table = without_backgrounds(table, np.arange(len(table)), touches.parent / "bare.parquet")
     rows = table.rows_of("test")
-    gels = UnitGels(table)
+    backgrounds = Backgrounds(table)
     (_, batch), *_ = evaluation(table, rows, settings(touches, batch_size=len(rows)))
     for clip, row in zip(batch.clip, rows.tolist(), strict=True):
-        ground = decode(table.file(row, "background_path")) if stored else gels(row)
+        ground = decode(table.file(row, "background_path")) if stored else backgrounds(row)
         np.testing.assert_array_equal(
             clip[0], np.clip(decode(table.file(row)).astype(int) - ground + 128, 0, 255)
         )
@@ -124,7 +124,7 @@ def without_backgrounds(table, rows, file):
     return manifests.from_columns(cells, file)
 
 
-def test_rows_without_a_picture_of_the_gel_get_the_median_of_their_unit(encoder, touches):
+def test_rows_without_a_image_of_the_gel_get_the_median_of_their_unit(encoder, touches):
     table = manifests.read(touches)
     rows = table.rows_of("test")
     bare = without_backgrounds(table, np.arange(len(table)), touches.parent / "bare.parquet")
@@ -136,7 +136,7 @@ def test_rows_without_a_picture_of_the_gel_get_the_median_of_their_unit(encoder,
     whole = embed_rows(encoder, table, rows, log=said.append)[1]
     assert (
         np.abs(values - whole).max() > 1e-3
-        and f"untouched gel: a stored picture for {len(rows)} rows" in said
+        and f"untouched gel: a stored image for {len(rows)} rows" in said
     )
 
 
@@ -154,12 +154,12 @@ def test_rows_that_are_too_few_for_a_median_are_left_out_and_counted(encoder, to
     ids, _ = embed_rows(encoder, alone, np.arange(3), log=said.append)
     assert (
         ids.tolist() == [0, 2]
-        and "1 of 3 rows have no picture of the untouched gel, and are left out" in said
+        and "1 of 3 rows have no image of the untouched gel, and are left out" in said
     )
     with pytest.raises(UserError, match=r"too few frames to estimate it.*background_path"):
         embed_rows(encoder, alone, np.array([1]), log=said.append)
     with pytest.raises(
-        SampleError, match=r"row \d+ of .* has no picture of the untouched gel.*background_path"
+        SampleError, match=r"row \d+ of .* has no image of the untouched gel.*background_path"
     ):
         list(evaluation(alone, np.arange(3), settings(touches)))
     ((ids, _),) = evaluation(alone, np.arange(3), settings(touches, on_bad_sample="skip"))
@@ -167,7 +167,7 @@ def test_rows_that_are_too_few_for_a_median_are_left_out_and_counted(encoder, to
     assert len(list(evaluation(alone, np.arange(3), settings(touches, "keep")))) == 1
 
 
-def test_a_picture_frames_or_a_head_decide_what_a_camera_subtracts(encoder):
+def test_a_image_frames_or_a_head_decide_what_a_camera_subtracts(encoder):
     frames = [GEL, np.clip(GEL + 20, 0, 255).astype(np.uint8)]
     see = Preprocess(encoder)  # a running estimate
     assert [int(np.median(see(one))) for one in frames] == [128, 148] and see.estimated
@@ -223,7 +223,7 @@ def test_a_folder_is_embedded_like_the_manifest_that_names_its_background(
         "'gelslim' was not in training" in words or "untouched gel" in words for words in said
     )
     np.testing.assert_allclose(np.load(tmp_path / "a.npz")["features"], wanted, atol=1e-5)
-    # one picture, less itself, is nothing
+    # one image, less itself, is nothing
     assert main([*words, "--out", str(tmp_path / "b.npz")]) == 2
     assert "too few frames to estimate the untouched gel" in capsys.readouterr().err
     for number in range(1, 7):
@@ -242,11 +242,11 @@ def test_training_leaves_out_the_rows_of_a_sensor_of_few_frames(touches):
         cells["background_path"][row], cells["sensor"][row] = None, "taxim"
     config = settings(touches)
     holed = manifests.from_columns(cells, touches.parent / "holed.parquet")
-    left_out = f"3 of {len(rows)} rows have no picture of the untouched gel, and are left out"
+    left_out = f"3 of {len(rows)} rows have no image of the untouched gel, and are left out"
     assert left_out in Loader(holed, config).notes
     with pytest.raises(
         manifests.ManifestError,
-        match=r"row 0 of .* and 2 other rows have no picture.*Record 5 frames",
+        match=r"row 0 of .* and 2 other rows have no image.*Record 5 frames",
     ):
         Loader(manifests.select_rows(holed, rows[:3]), config)
 
@@ -315,7 +315,7 @@ def test_a_stream_is_marked_until_its_untouched_gel_is_settled_or_captured(encod
         gate = ContactGate(preprocess, "digit")
         arrived = list(
             stream(
-                encoder, Film(np.flip(frames, -1)), preprocess, live=False, sensor=0, contact=gate
+                encoder, Video(np.flip(frames, -1)), preprocess, live=False, sensor=0, contact=gate
             )
         )
         assert [one.estimated for one in arrived] == [True] * marked + [False] * (

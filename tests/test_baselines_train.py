@@ -14,7 +14,7 @@ EVERY = [(name, stage) for name, one in presets.BASELINES.items() for stage in o
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
-    """Two sensors at the same places, four frames each, some with photograph and caption."""
+    """Two sensors at the same places, four frames each, some with RGB image and caption."""
     folder = tmp_path_factory.mktemp("touches")
     return make_touches(
         folder, touches={"train": 8}, frames=4, each=2, sensors=("digit", "gelslim")

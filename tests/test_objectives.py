@@ -229,7 +229,7 @@ def test_the_weights_of_the_sum(recipe):
     assert 0 <= float(m["match_accuracy"]) <= 1
 
 
-def test_touches_of_one_shape_share_a_pass_and_keep_their_rows():
+def test_touches_of_one_shape_fraction_a_pass_and_keep_their_rows():
     touches = [*zip(MATCH[:6:2], MATCH[1::2], strict=True), (MATCH.clip[:2], MATCH.sensor[:2])]
     z = embed(PARAMS2, touches)
     for (clip, sensor), got in zip(touches, z, strict=True):
@@ -270,10 +270,10 @@ def test_cosine_matching_has_the_other_places_of_the_batch_as_negatives():
 
 
 @pytest.mark.parametrize(
-    ("share", "count"), [(0.25, 4), (0.01, 1)]
-)  # one patch stays, however small the share
-def test_patches_that_matching_drops_have_no_influence(share, count):
-    config = changed(CONFIG2, match_keep=share)
+    ("fraction", "count"), [(0.25, 4), (0.01, 1)]
+)  # one patch stays, however small the fraction
+def test_patches_that_matching_drops_have_no_influence(fraction, count):
+    config = changed(CONFIG2, match_keep=fraction)
     noise = RNG.random((3, 4, 16)).astype("f4")
     match = MatchBatch(floats(4, 1), SENSOR, floats(4, 1), SENSOR, floats(4, 1), SENSOR)
 
@@ -462,7 +462,7 @@ def test_the_loss_falls_on_a_fixed_batch(stage):
         (2, 4),
     ],
 )
-def test_devices_share_the_batch_and_change_nothing(stage, devices):
+def test_devices_fraction_the_batch_and_change_nothing(stage, devices):
     (one, wanted) = steps(stage, 1, 2)
     (many, result) = steps(stage, devices, 2)
     for a, b in zip(result, wanted, strict=True):

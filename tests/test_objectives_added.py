@@ -194,7 +194,7 @@ def test_the_residual_begins_as_a_copy_of_the_last_frame(norm):
 
 
 def test_a_residual_is_learned_where_the_next_frame_is_the_last_one(world, tmp_path):
-    config = run_config(world, steps=2).with_settings({"data.clip_share": 1.0})
+    config = run_config(world, steps=2).with_settings({"data.clip_fraction": 1.0})
     losses = []
     for residual in (False, True):
         own = config.with_settings({"objective.next_frame_residual": residual})

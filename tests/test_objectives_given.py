@@ -158,7 +158,7 @@ def test_groups_are_halves_that_do_not_know_of_each_other(what):
 
 
 @pytest.mark.parametrize("head", ["mlp", "linear"])
-def test_the_accuracy_of_matching_is_the_share_of_right_verdicts(head):
+def test_the_accuracy_of_matching_is_the_fraction_of_right_verdicts(head):
     config = changed(tiny_config(2), {"match_head": head})
     net = compiled(config.model)
     params = net.params

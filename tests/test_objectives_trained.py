@@ -37,7 +37,7 @@ def matched(frames: int, head: str) -> MatchBatch:
 
 
 def batches(config: Config, every: bool) -> list:
-    """Every kind of batch that the loader makes for a configuration, with and without photographs
+    """Every kind of batch that the loader makes for a configuration, with and without RGB images
     and captions.
 
     Not `every`: the fullest and the emptiest alone, where the configuration changes no path of a

@@ -49,7 +49,7 @@ def straight(tmp_path_factory, world):
 
 def clips_only(config):
     """Stage 2 on clips alone: one program instead of two."""
-    return replace(config, data=replace(config.data, clip_share=1.0))
+    return replace(config, data=replace(config.data, clip_fraction=1.0))
 
 
 @pytest.fixture(scope="session")

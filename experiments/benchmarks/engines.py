@@ -78,7 +78,7 @@ def encoders_on(source: Encoder, table: Any, frames: int, folder: Path) -> dict[
 def errors(
     encoders: dict[str, Encoder], touches: tuple[np.ndarray, np.ndarray]
 ) -> dict[str, float]:
-    """Return the largest difference of features from the first engine, as a share of its largest
+    """Return the largest difference of features from the first engine, as a fraction of its largest
     feature.
     """
     found = {

@@ -37,7 +37,7 @@ SHOWN = (
     "samples",
     "ratio",
     "seconds",
-    "peak_share",
+    "peak_fraction",
     "error_gradient",
     "error_output",
     "gradient",

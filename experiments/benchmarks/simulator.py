@@ -1,5 +1,5 @@
-"""Simulated touches: frames a second, error of the fast solver against the exact one, share of the
-roofline.
+"""Simulated touches: frames a second, error of the fast solver against the exact one, fraction of
+the roofline.
 
     python -m experiments.benchmarks.simulator --out experiments/results/simulator.jsonl
 
@@ -41,7 +41,7 @@ def parse(args: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("--sensors", nargs="*", default=CAMERAS, choices=CAMERAS)
     parser.add_argument(
-        "--sizes", nargs="*", type=int, default=(112, 224), help="pixels of a picture's side"
+        "--sizes", nargs="*", type=int, default=(112, 224), help="pixels of an image's side"
     )
     parser.add_argument("--frames", nargs="*", type=int, default=(1, 3), help="frames of a touch")
     parser.add_argument("--batch", type=int, default=16, help="touches a call; a GPU wants 1024")

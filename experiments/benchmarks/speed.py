@@ -43,8 +43,8 @@ class SpeedRow:
 
     Seconds and ratios are medians over rounds, `*_iqr` their interquartile ranges.
 
-    `operations`: useful ones a call (`workloads`); `peak_share` of the matrix product of the
-    variant's own type, and `float32_share` of the float32 one, in the same rounds. `error_*`:
+    `operations`: useful ones a call (`workloads`); `peak_fraction` of the matrix product of the
+    variant's own type, and `float32_fraction` of the float32 one, in the same rounds. `error_*`:
     relative L2 against float64 (of the loss: relative). `peak_bytes`: arguments, results and
     temporaries of the compiled program. `copies`: copy instructions in it. `p50`, `p99`: seconds of
     single calls.
@@ -58,8 +58,8 @@ class SpeedRow:
     ratio: float = NAN
     ratio_iqr: float = NAN
     operations: float = NAN
-    peak_share: float = NAN
-    float32_share: float = NAN
+    peak_fraction: float = NAN
+    float32_fraction: float = NAN
     p50: float = NAN
     p99: float = NAN
     calls: int = 0
@@ -327,8 +327,8 @@ def _row(
         ratio=float(np.median(ratios)),
         ratio_iqr=_iqr(ratios),
         operations=operations,
-        peak_share=rate / peaks[_kind(program)],
-        float32_share=rate / peaks[_FULL],
+        peak_fraction=rate / peaks[_kind(program)],
+        float32_fraction=rate / peaks[_FULL],
         p50=float(np.percentile(times, 50)),
         p99=float(np.percentile(times, 99)),
         calls=times.size,

@@ -27,7 +27,7 @@ from anytouch_jax.train.optim import optimizer
 from anytouch_jax.train.step import init_state, make_step
 
 Tree = Any
-# shares of a stage-2 batch that have a photograph, a caption
+# fractions of a stage-2 batch that have an RGB image, a caption
 VISION = 0.25
 TEXT = 0.5
 # samples a step, where none is asked for
@@ -61,8 +61,8 @@ class Workload:
         return replace(self, samples=samples)
 
 
-def _share(samples: int, share: float) -> int:
-    return max(1, round(samples * share))
+def _fraction(samples: int, fraction: float) -> int:
+    return max(1, round(samples * fraction))
 
 
 def workloads(
@@ -115,9 +115,9 @@ def make_batch(work: Workload, seed: int = 0) -> TouchBatch | Stage2Batch:
     return Stage2Batch(align, None)
 
 
-def _rows(work: Workload, share: float, offset: int) -> np.ndarray:
+def _rows(work: Workload, fraction: float, offset: int) -> np.ndarray:
     """Rows of the batch that have a modality, spread evenly."""
-    count = _share(work.samples, share)
+    count = _fraction(work.samples, fraction)
     return np.sort((np.arange(count) * work.samples // count + offset) % work.samples).astype(
         np.int32
     )

@@ -35,7 +35,7 @@ from experiments.compare.table import families_table
 from experiments.pages.page import markdown
 from experiments.records import read_records, write_record
 
-PROTOCOLS = ("honest", "published")
+PROTOCOLS = ("grouped", "released")
 RESULTS = Path("experiments/results/compare.jsonl")
 YOURS = Path("runs/compare/compare.jsonl")
 

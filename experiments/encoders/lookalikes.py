@@ -39,7 +39,7 @@ def recall(encoders: dict[str, Encoder], path: Path) -> dict[str, Any]:
     features["pixels"] = background_difference(table, rows)
     found = retrieval.cross_sensor_retrieval(table, features, rows, centre=(True,))
     scores = {
-        one.name: {"share": one.top1, "interval": [one.low, one.high]}
+        one.name: {"fraction": one.top1, "interval": [one.low, one.high]}
         for one in found
         if one.query_sensor == retrieval.ALL
     }

@@ -34,7 +34,7 @@ from anytouch_jax.fields.outputs import FORCE, LENGTH, STATES, TORQUE, FieldOutp
 from anytouch_jax.nn.functional import build
 from anytouch_jax.objectives import normalise_touch
 from anytouch_jax.sim import endless, scene
-from anytouch_jax.sim.batches import FIELDS, field_batch, moved_gel
+from anytouch_jax.sim.batches import FIELDS, field_batch, misregistered_background
 from anytouch_jax.train.loop import fit
 from anytouch_jax.train.mesh import enable_compilation_cache
 from anytouch_jax.train.progress import to_stderr as log
@@ -104,7 +104,7 @@ def batches(
         draw, prepare, toss = jax.random.split(key, 3)
         touches = endless.sample_touches(draw, world, sampling(frames, **options), count)
         if moved:
-            touches = moved_gel(jax.random.fold_in(key, 7), touches)
+            touches = misregistered_background(jax.random.fold_in(key, 7), touches)
         batch = field_batch(prepare, touches, jnp.asarray(rows)[touches.sensor], config, count)
         own = jax.random.uniform(toss, (count,)) >= UNIVERSAL
         sensor = jnp.where(own, batch.sensor, config.model.universal_row)
@@ -182,7 +182,7 @@ def sampler(
         draw, prepare, toss, move, deep = jax.random.split(key, 5)
         sampled = sampling(frames, wild=0.2, free=0.12)
         drawn = deepened(deep, endless.draw_touches(draw, world, sampled, count))
-        touches = moved_gel(move, endless.simulate_drawn(drawn, sampled))
+        touches = misregistered_background(move, endless.simulate_drawn(drawn, sampled))
         batch = field_batch(prepare, touches, jnp.asarray(rows)[touches.sensor], config, count)
         own = jax.random.uniform(toss, (count,)) >= UNIVERSAL
         sensor = jnp.where(own, batch.sensor, config.model.universal_row)
@@ -263,7 +263,7 @@ def rewrite(folder: Path, out: Path, loaded: Any) -> None:
 
 
 def subtracted(config: Config) -> Config:
-    """Return the configuration of a user who has the picture of the untouched gel."""
+    """Return the configuration of a user who has the image of the untouched gel."""
     return config.with_settings({"data.background": "subtract"})
 
 
@@ -317,8 +317,8 @@ def scores(
     """Return the errors of one sensor on new units and objects of the test split, stills and clips
     together.
 
-    `false_contact` and `false_force` are shares of gels that nothing touches, but that moved a
-    little since the picture of them: those with a pixel of contact, and those with more than 0.05
+    `false_contact` and `false_force` are fractions of gels that nothing touches, but that moved a
+    little since the image of them: those with a pixel of contact, and those with more than 0.05
     N.
     """
     world = world_of("test", sensors=(sensor,))
@@ -330,7 +330,7 @@ def scores(
     def read(number: int, frames: int, free: float) -> tuple[Any, ...]:
         key = jax.random.fold_in(jax.random.key(11), number)
         touch = sample(key, world, sampling(frames, wild=0, free=free), size)
-        touch = moved_gel(key, touch) if free else touch
+        touch = misregistered_background(key, touch) if free else touch
         batch = field_batch(key, touch, jnp.full((size, 1), row), config, size)
         out = measure(params, normalise_touch(batch.clip), batch.sensor, batch.aspect)
         return tuple(jax.device_get((out, batch, touch)))
@@ -406,15 +406,15 @@ def touch_errors(
     depth, true = out.depth * width[pixels], batch.depth * width[pixels]
     seen = out.contact > 0
     enough = touched.sum((1, 2)) >= 8
-    share = (np.abs(depth - true) * touched).sum((1, 2)) / np.maximum(touched.sum((1, 2)), 1)
+    fraction = (np.abs(depth - true) * touched).sum((1, 2)) / np.maximum(touched.sum((1, 2)), 1)
     either = (seen | touched).sum((1, 2))
     scale = stiff * width**2 * 1e-3
     force, real = out.force[:, 2] * scale, batch.force[:, 2] * scale
     deviation = np.sqrt(2) * np.exp(5 * np.tanh(out.depth_log / 5)) * LENGTH * factor
     inside = np.abs(out.depth - batch.depth)[touched] < deviation[touched]
     values = {
-        "depth": share[enough],
-        "relative": (share / np.maximum(true.max((1, 2)), 1e-3))[enough],
+        "depth": fraction[enough],
+        "relative": (fraction / np.maximum(true.max((1, 2)), 1e-3))[enough],
         "iou": ((seen & touched).sum((1, 2)) / np.maximum(either, 1))[enough],
         "inside": inside,
         "force": (np.abs(force - real) / np.maximum(real, 0.05))[enough],

@@ -3,7 +3,7 @@ frozen encoder.
 
     python -m experiments.encoders.motion anytouch-tiny --data data/corpus/*/manifest.parquet
 
-Features that are averaged over a picture say little about the sign of a turn. The head reads a
+Features that are averaged over an image say little about the sign of a turn. The head reads a
 vector from every patch: how its token differs from that of the clip played backwards. A clip has
 the first, the middle and the last touched frame, and its tokens are those after a third and two
 thirds of the blocks. Playing it backwards turns all vectors around. A turn is the sum of the
@@ -191,7 +191,7 @@ def fit(clips: Clips, train: Array, val: Array) -> dict[str, jax.Array]:
 
 
 def score(params: dict[str, jax.Array], clips: Clips, rows: Array) -> dict[str, Any]:
-    """Return the shares of turns and slides named right on `rows`, with 95 % intervals over
+    """Return the fractions of turns and slides named right on `rows`, with 95 % intervals over
     touches.
     """
     x = (clips.tokens[rows] - np.asarray(params["mean"])) / np.asarray(params["spread"])
@@ -206,24 +206,24 @@ def score(params: dict[str, jax.Array], clips: Clips, rows: Array) -> dict[str, 
         right = (named[what] == truth)[known].astype(float)
         result[what] = {
             "clips": int(known.sum()),
-            "share": float(right.mean()) if known.any() else None,
+            "fraction": float(right.mean()) if known.any() else None,
             "interval": mean_interval(right, clips.touch[rows][known]),
         }
     return result
 
 
 def pooled_score(clips: Clips, splits: dict[str, Array]) -> float:
-    """Return the share of test turns that a linear probe names right on the change of the mean
+    """Return the fraction of test turns that a linear probe names right on the change of the mean
     token.
     """
     change = (clips.tokens[:, 1].astype(np.float32) - clips.tokens[:, 0]).mean(1)
     rows = {split: one[clips.turn[one] != "none"] for split, one in splits.items()}
     models = heads.linear_path(change[rows["train"]], clips.turn[rows["train"]], (1.0, 0.1, 0.01))
 
-    def share(model: heads.LinearModel, split: str) -> float:
+    def fraction(model: heads.LinearModel, split: str) -> float:
         return float(np.mean(model(change[rows[split]]) == clips.turn[rows[split]]))
 
-    return share(max(models, key=lambda model: share(model, "val")), "test")
+    return fraction(max(models, key=lambda model: fraction(model, "val")), "test")
 
 
 def main() -> None:

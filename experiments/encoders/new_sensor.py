@@ -1,4 +1,4 @@
-"""A known sensor as if it was new: fitted from pictures of one device, adapted by simulation, then
+"""A known sensor as if it was new: fitted from images of one device, adapted by simulation, then
 asked.
 
     python -m experiments.encoders.new_sensor anytouch-tiny --minutes 4
@@ -6,7 +6,7 @@ asked.
 A simulated device of DIGIT, GelSlim and 9DTact has hidden parameters. Its tokens are trained on
 simulated touches of the fitted sensor alone. Then the device itself, of the hidden parameters,
 touches held-out objects: which of some 150 touches by other sensors is the same, how deep, and how
-hard? A GelSight Mini is fitted to real pictures, and asked for real objects. The parts of the
+hard? A GelSight Mini is fitted to real images, and asked for real objects. The parts of the
 encoder that all sensors share have met every sensor in training. But those of commit 7546a43 had
 not met the colours that a GelSight Mini has now:
 
@@ -52,7 +52,7 @@ from experiments.records import write_record
 HIDDEN = ("digit", "gelslim", "9dtact")
 REAL = "gelsight_mini"
 # to fit a sensor to; their least score of contact; of touches
-PICTURES = 18
+IMAGES = 18
 PRESSED = 7.0
 BATCHES = 8
 
@@ -72,7 +72,7 @@ def device_touches(key: Any, world: Any, unit: Any, sampling: Sampling) -> Any:
 
 def adapted_to(  # noqa: PLR0913, what a study varies
     encoder: Encoder,
-    pictures: list[np.ndarray],
+    images: list[np.ndarray],
     gel: np.ndarray,
     width_mm: float,
     name: str,
@@ -81,7 +81,7 @@ def adapted_to(  # noqa: PLR0913, what a study varies
     seed: int,
     ball_mm: float | None = None,
 ) -> tuple[Encoder, str, dict[str, Any]]:
-    """Return an encoder with tokens for the sensor of these pictures, the name of the tokens, and
+    """Return an encoder with tokens for the sensor of these images, the name of the tokens, and
     how it was fitted.
 
     Tokens that find fewer touches than the universal ones are refused: then the universal ones
@@ -90,7 +90,7 @@ def adapted_to(  # noqa: PLR0913, what a study varies
     mine = folder / f"my_{name}.sensor"
     run = folder / f"run_{name}"
     fitted = fit_sensor(
-        pictures, f"new_{name.strip('9')}_unit", width_mm, mine, background=gel, ball_mm=ball_mm
+        images, f"new_{name.strip('9')}_unit", width_mm, mine, background=gel, ball_mm=ball_mm
     )
     about: dict[str, Any] = {"simulated": None}
     known = tuple(other for other in CAMERAS if other != name)
@@ -126,11 +126,11 @@ def study(
         touches(jax.random.fold_in(root, 1), own(name, "train", ball_mm=ball_mm))
     )
     height, width = (round(SIZE * side / min(SENSORS[name].field)) for side in SENSORS[name].field)
-    seen = (first.background[0, 1], *first.clip[:PICTURES, 1, -1])
-    gel, *pictures = (cv2.resize(one, (width, height)) for one in seen)
+    seen = (first.background[0, 1], *first.clip[:IMAGES, 1, -1])
+    gel, *images = (cv2.resize(one, (width, height)) for one in seen)
     width_mm = float(SENSORS[name].field[1] * device.zoom)
     after, own_name, about = adapted_to(
-        encoder, pictures, gel, width_mm, name, folder, minutes, seed, ball_mm
+        encoder, images, gel, width_mm, name, folder, minutes, seed, ball_mm
     )
     rows = {
         "universal": (encoder, encoder.config.model.universal_row),
@@ -171,7 +171,7 @@ def study(
         "touches": len(target),
         "scores": {
             kind: {
-                "share": float(one.mean()),
+                "fraction": float(one.mean()),
                 "interval": mean_interval(one.astype(float), objects),
             }
             for kind, one in right.items()
@@ -184,7 +184,7 @@ def study(
 def _mean(errors: list[dict[str, np.ndarray]], name: str) -> dict[str, Any]:
     values = np.concatenate([one[name] for one in errors], dtype=float)
     return {
-        "share": float(values.mean()),
+        "fraction": float(values.mean()),
         "interval": mean_interval(values, np.arange(len(values))),
     }
 
@@ -192,7 +192,7 @@ def _mean(errors: list[dict[str, np.ndarray]], name: str) -> dict[str, Any]:
 def real_study(
     encoder: Encoder, pack: Path, folder: Path, minutes: float, seed: int
 ) -> dict[str, Any]:
-    """Return scores on real objects of a GelSight Mini whose look is fitted to its real pictures of
+    """Return scores on real objects of a GelSight Mini whose look is fitted to its real images of
     training.
     """
     data = recordings.read(pack)
@@ -200,14 +200,12 @@ def real_study(
     pressed = np.flatnonzero((data.split == "train") & (data.finger == "cam0") & (score > PRESSED))
     gel_name = data.manifest.text_column("background_path")[pressed]
     pressed = pressed[gel_name == np.unique(gel_name)[-1]]
-    chosen = np.random.default_rng(seed).choice(pressed, PICTURES, replace=False)
-    gel = data.gels.shared(lambda picture: picture)(chosen[0])
+    chosen = np.random.default_rng(seed).choice(pressed, IMAGES, replace=False)
+    gel = data.backgrounds.shared(lambda image: image)(chosen[0])
     assert gel is not None
-    pictures = [decode(data.manifest.file(row)) for row in chosen]
+    images = [decode(data.manifest.file(row)) for row in chosen]
     width_mm = SENSORS[REAL].field[1]
-    after, own_name, about = adapted_to(
-        encoder, pictures, gel, width_mm, REAL, folder, minutes, seed
-    )
+    after, own_name, about = adapted_to(encoder, images, gel, width_mm, REAL, folder, minutes, seed)
     rows = {"universal": (encoder, UNIVERSAL), "adapted": (after, own_name), "own": (encoder, REAL)}
     found = {
         kind: other_finger_score(encoder_features(reader, data, sensor=name), data)
@@ -215,7 +213,8 @@ def real_study(
     }
     return about | {
         "scores": {
-            kind: {"share": one.share, "interval": one.interval()} for kind, one in found.items()
+            kind: {"fraction": one.fraction, "interval": one.interval()}
+            for kind, one in found.items()
         }
     }
 

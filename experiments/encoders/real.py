@@ -6,7 +6,7 @@ touch allow.
 Taken are train rows of a GelSight Mini or a 9DTact, with a background and a licence for commercial
 use. The slip clips of the first pack are left out, since the second pack has them with other
 splits. A touch of the second pack is a group of grasps: recordings of one object, by either finger,
-whose contact pictures agree.
+whose contact images agree.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ TOUCHED = 5.0  # of label.contact_score in the second pack. The rows of the firs
 def copy(
     pack: Path, out: Path, keep: Callable[[Row], bool], contact: Callable[[Row], bool]
 ) -> Path:
-    """Copy the train rows of a pack that `keep` allows, with their pictures and a label.contact."""
+    """Copy the train rows of a pack that `keep` allows, with their images and a label.contact."""
     with (pack / "manifest.csv").open(encoding="utf-8", newline="") as file:
         rows = [
             row
@@ -50,7 +50,7 @@ def copy(
 
 
 def _shrink(source: Path, target: Path) -> None:
-    """Write a picture with a short side of SHORT pixels at most, so that all of them fit an
+    """Write an image with a short side of SHORT pixels at most, so that all of them fit an
     upload.
     """
     image = cv2.imread(str(source))

@@ -3,7 +3,7 @@
     python -m experiments.encoders.train --minutes 12 --real data/real/pack2/manifest.csv --out
     runs/anytouch-tiny
 
-Each stage gets a share of the time, compilation included, and its schedule follows the time. The
+Each stage gets a fraction of the time, compilation included, and its schedule follows the time. The
 next call starts from the weights in OUT/state, on this machine or another, and trains stage 2 again
 for its whole time: a cycle. Touches are simulated in the training program. With a GPU the batches
 are large and the arithmetic has 16 bits.
@@ -57,10 +57,10 @@ STAGES: dict[int, dict[str, Any]] = {
         "model.match_head": "cosine",
         "objective.match_weight": 4.0,
         "objective.field_weight": 0.2,
-        "data.clip_share": 0.34,
+        "data.clip_fraction": 0.34,
     },
 }
-# Device: touches of a batch of stage 1, pairs of stage 2, share of the patches that matching
+# Device: touches of a batch of stage 1, pairs of stage 2, fraction of the patches that matching
 # encodes, more settings.
 DEVICES: dict[str, tuple[int, int, float, dict[str, Any]]] = {
     "gpu": (1024, 640, 0.6, {"model.dtype": "bfloat16"}),
@@ -100,7 +100,7 @@ def main() -> None:
     parser.add_argument("--real", nargs="*", default=[], help="manifests of real recordings")
     parser.add_argument("--out", type=Path, default=Path("runs/anytouch-tiny"))
     parser.add_argument(
-        "--stage1-share", type=float, default=0.3, help="of the time of the first call"
+        "--stage1-fraction", type=float, default=0.3, help="of the time of the first call"
     )
     parser.add_argument(
         "--stages", type=int, nargs="+", default=[1, 2], help="stages to train in a first call"
@@ -125,7 +125,7 @@ def main() -> None:
     stages = [2] if init else given.stages
     for stage in stages:
         run = given.out / f"cycle-{cycle:02d}" / f"stage{stage}"
-        until = end if stage == stages[-1] else begun + 60 * given.minutes * given.stage1_share
+        until = end if stage == stages[-1] else begun + 60 * given.minutes * given.stage1_fraction
         config = configure(stage, given.real, cycle, changes)
         result = pretrain(config, run, init=init, log=log, until=until)
         log(

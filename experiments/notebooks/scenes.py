@@ -1,4 +1,4 @@
-"""The simulated scenes and the pictures of the notebooks."""
+"""The simulated scenes and the images of the notebooks."""
 
 from __future__ import annotations
 
@@ -19,14 +19,15 @@ from anytouch_jax.sim.dataset import simulate
 from anytouch_jax.sim.scene import Scenes
 from anytouch_jax.train.progress import silent
 
-DEMO = Path(__file__).resolve().parents[2] / "runs" / "demo" / "scenes"  # those of `make demo`
+FOLDER = Path(__file__).resolve().parents[2] / "runs" / "notebooks" / "scenes"
 
 
 def scenes() -> at.Manifest:
-    """Return the manifest of the scenes of `make demo`, or of the folder SCENES. They are simulated
-    if missing.
+    """Return the manifest of the scenes of the notebooks, or of the folder SCENES.
+
+    They are simulated if they are missing.
     """
-    folder = Path(os.environ.get("SCENES") or DEMO)
+    folder = Path(os.environ.get("SCENES") or FOLDER)
     if not (folder / "manifest.parquet").exists():
         simulate(Scenes(touches=500, objects=250, size=128), folder)
     return at.read_manifest(folder / "manifest.parquet")
@@ -71,8 +72,8 @@ def embed(encoder: at.Encoder, table: at.Manifest, rows: np.ndarray) -> np.ndarr
     return embed_rows(encoder, table, rows, pooling="both", log=silent)[1]
 
 
-def small_pictures(table: at.Manifest, rows: np.ndarray) -> np.ndarray:
-    """Return the change of pictures from the untouched gel as features (n, d): what needs no
+def small_images(table: at.Manifest, rows: np.ndarray) -> np.ndarray:
+    """Return the change of images from the untouched gel as features (n, d): what needs no
     encoder.
     """
     size = (24, 24)
@@ -85,26 +86,26 @@ def small_pictures(table: at.Manifest, rows: np.ndarray) -> np.ndarray:
 
 
 def show(
-    pictures: Sequence[np.ndarray], titles: Sequence[str], across: int, size: float = 1.7
+    images: Sequence[np.ndarray], titles: Sequence[str], across: int, size: float = 1.7
 ) -> None:
-    """Show pictures in rows of `across`, each with a title."""
-    down = -(-len(pictures) // across)
+    """Show images in rows of `across`, each with a title."""
+    down = -(-len(images) // across)
     figure, axes = plt.subplots(
         down, across, figsize=(size * across, (size + 0.2) * down), squeeze=False
     )
     for axis in axes.flat:
         axis.axis("off")
-    for axis, picture, title in zip(axes.flat, pictures, titles, strict=False):
-        axis.imshow(picture)
+    for axis, image, title in zip(axes.flat, images, titles, strict=False):
+        axis.imshow(image)
         axis.set_title(title, fontsize=8)
     figure.tight_layout()
     plt.show()
 
 
 def show_file(path: Path, width: float = 10) -> None:
-    """Show a picture file."""
-    picture = plt.imread(path)
-    plt.figure(figsize=(width, width * picture.shape[0] / picture.shape[1]))
-    plt.imshow(picture)
+    """Show an image file."""
+    image = plt.imread(path)
+    plt.figure(figsize=(width, width * image.shape[0] / image.shape[1]))
+    plt.imshow(image)
     plt.axis("off")
     plt.show()

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_write
-from experiments.pages import encoders, page, paper, speed
+from experiments.pages import encoders, page, paper, simulators, speed
 from experiments.pages.page import Page, Table
 from experiments.records import read_records
 
@@ -34,6 +34,7 @@ PAGES: Mapping[str, tuple[str, Callable[[Path], Page]]] = {
     "ablations": ("matrix.jsonl/ablations", paper.ablations),
     "pouring": ("pouring.jsonl", paper.pouring),
     "translation": ("translation.jsonl", paper.translation),
+    "mujoco": ("mujoco.jsonl", simulators.mujoco),
     "speed": ("variants.jsonl", speed.speed),
 }
 

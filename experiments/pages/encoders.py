@@ -34,14 +34,14 @@ def _minus(score: Score | None, other: Score | None) -> Value | None:
     return percent(score.minus(other))
 
 
-def _share(score: Score | None) -> Value | None:
+def _fraction(score: Score | None) -> Value | None:
     if score is None:
         return None
-    return percent((score.share, *score.interval()))
+    return percent((score.fraction, *score.interval()))
 
 
 def real(folder: Path) -> Page:
-    """Encoders on real recordings, with and without pictures of the untouched gel."""
+    """Encoders on real recordings, with and without images of the untouched gel."""
     path = folder / "real.jsonl"
     records = read_records(path)
     check_alike(path, [{"data": one["data"]} for one in records.values()])
@@ -66,7 +66,7 @@ def real(folder: Path) -> Page:
             against = (pixels, None if end else fresh) if learned else (None, None)
             against = (*against, scores[plain][0] if end else None)
             changes = [_minus(linear, other) for other in against]
-            found.append((task, name, _share(linear or trained), _share(near), *changes))
+            found.append((task, name, _fraction(linear or trained), _fraction(near), *changes))
             if records[name]["kind"] == "encoder" and learned:
                 others = (f"pixels{end}", "an untrained encoder", f"`{plain}` by the rule")
                 findings += [
@@ -94,7 +94,10 @@ def motion(folder: Path) -> Page:
             (
                 name,
                 row,
-                *(percent([found[k]["share"], *found[k]["interval"]]) for k in ("turn", "slide")),
+                *(
+                    percent([found[k]["fraction"], *found[k]["interval"]])
+                    for k in ("turn", "slide")
+                ),
             )
             for row, found in scores.items()
         ]
@@ -103,23 +106,23 @@ def motion(folder: Path) -> Page:
             f"probe on the mean token names {100 * record['pooled']:.0f} %."
         )
         rows += own
-    answer = "A small head on the patch tokens names this share of turns of new objects."
+    answer = "A small head on the patch tokens names this fraction of turns of new objects."
     return Page("motion", [rows], findings, (answer, f"{rows[0][2].shown()} %"))
 
 
 def measure(folder: Path) -> Page:
     """Errors of depth, shear and force, simulated and on real balls."""
     sensors = read_records(folder / "measure.jsonl")
-    shares = {
+    fractions = {
         name: {part: 100 * value for part, value in one.items() if isinstance(value, float)}
         for name, one in sensors.items()
     }
     rows = [
-        (name, one["depth"], *map(shares[name].get, ("iou", "force", "inside")))
+        (name, one["depth"], *map(fractions[name].get, ("iou", "force", "inside")))
         for name, one in sensors.items()
     ]
     others = ("dots_shear", "drag", "shear", "false_contact", "false_force")
-    along = [(name, *map(one.get, others)) for name, one in shares.items()]
+    along = [(name, *map(one.get, others)) for name, one in fractions.items()]
     balls = {
         name: one for name, one in read_records(folder / "balls.jsonl").items() if "centre" in one
     }
@@ -183,7 +186,7 @@ def lookalikes(folder: Path) -> Page:
     for key, record in records.items():
         grade = f"{key} alignment"
         scores = {
-            name: percent([one["share"], *one["interval"]])
+            name: percent([one["fraction"], *one["interval"]])
             for name, one in record["scores"].items()
         }
         scores = dict(sorted(scores.items(), key=lambda item: -item[1].mean))
@@ -197,9 +200,11 @@ def lookalikes(folder: Path) -> Page:
         readme = scores if key == "fine" else readme
     if not (best := next(iter(readme), "")):
         return Page("lookalikes", [rows], findings)
-    answer = f"`{best}` finds this share first of 50, and raw pixels {readme['pixels'].mean:.1f} %."
+    answer = (
+        f"`{best}` finds this fraction first of 50, and raw pixels {readme['pixels'].mean:.1f} %."
+    )
     learned = (
-        [list(zip(curve["pairs"], (100 * share for share in curve["recall"]), strict=True))]
+        [list(zip(curve["pairs"], (100 * fraction for fraction in curve["recall"]), strict=True))]
         if curve
         else []
     )
@@ -224,7 +229,7 @@ def new_sensor(folder: Path) -> Page:
 
     def value(record: Record, part: str, kind: str, unit: float) -> Value | None:
         one = record.get(part, {}).get(kind)
-        return one and Value(one["share"], *one["interval"]).times(unit)
+        return one and Value(one["fraction"], *one["interval"]).times(unit)
 
     for key, record in read_records(folder / "new_sensor.jsonl").items():
         steps = record["simulated"][0] if record["simulated"] else 0
@@ -282,7 +287,7 @@ def trust(folder: Path) -> Page:
     findings.append(
         f"{alarmed} of {sum(one['units'] for one in units.values())} good units raise an alarm."
     )
-    answer = f"Of sets that should hold the class in 90 %, this share does. {findings[-2]}"
+    answer = f"Of sets that should hold the class in 90 %, this fraction does. {findings[-2]}"
     return Page(
         "trust",
         [rows, faults],

@@ -75,7 +75,7 @@ class Page:
     answers the question.
 
     A table is rows for the next table of the record, or a Table. Only findings that show a
-    difference are printed. `answer` is another answer with its figure. The picture has the first
+    difference are printed. `answer` is another answer with its figure. The image has the first
     table, or is drawn by `figure`, which is given the path. `readme` has the values by name that
     the README repeats, and `words` what the record leaves open.
     """

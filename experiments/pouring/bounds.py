@@ -90,7 +90,7 @@ class Scales:
     """Notes the load of stacked runs `setups` while another controller acts, or acts on it with the
     MLP `head`.
 
-    It gets the load on the gel, with blows and jolts, and no picture. No touch of this gel holds
+    It gets the load on the gel, with blows and jolts, and no image. No touch of this gel holds
     more information.
     """
 

@@ -75,10 +75,10 @@ class Setup(NamedTuple):
 
     `radius`, `height` mm of the cylinder and `empty` g of its mass; `bead` mm across; `bulk` g /
     mm^3; `repose` rad, the angle of repose; `tilt` rad at the start; `mount` rad from the tilt's
-    axis to the gel's normal; `grip_height` mm of the fingers; `grip` N, which falls by the share
-    `relax` within `relax_time` s; `share` of the load on the gel's finger; `friction` on the gel;
-    `jolt` N of the arm's step; `place` (2,) mm, `yaw` rad, `lean` (slope) of the cylinder on the
-    gel; `unit` of the sensor.
+    axis to the gel's normal; `grip_height` mm of the fingers; `grip` N, which falls by the fraction
+    `relax` within `relax_time` s; `fraction` of the load on the gel's finger; `friction` on the
+    gel; `jolt` N of the arm's step; `place` (2,) mm, `yaw` rad, `lean` (slope) of the cylinder on
+    the gel; `unit` of the sensor.
     """
 
     radius: Any
@@ -93,7 +93,7 @@ class Setup(NamedTuple):
     grip: Any
     relax: Any
     relax_time: Any
-    share: Any
+    fraction: Any
     friction: Any
     jolt: Any
     place: Any
@@ -157,7 +157,7 @@ def draw_setup(task: Task, rng: np.random.Generator) -> Setup:
         "grip": rng.uniform(5, 10),
         "relax": rng.uniform(0.02, 0.1),
         "relax_time": rng.uniform(5, 30),
-        "share": rng.uniform(0.5, 0.65),
+        "fraction": rng.uniform(0.5, 0.65),
         "friction": rng.uniform(0.5, 0.9),
         "jolt": rng.uniform(0.002, 0.01),
         "place": rng.normal(0, 0.6, 2),
@@ -313,8 +313,8 @@ def heap(mass: Array, slope: Array, setup: Setup) -> tuple[Array, Array]:
 
 
 def load(state: State, setup: Setup, task: Task, *, shocks: bool = True) -> Load:
-    """What the gel bears: its share of weight and torque, and the grip, which the weight presses or
-    eases.
+    """What the gel bears: its fraction of weight and torque, and the grip, which the weight
+    presses or eases.
 
     In the first STAND moments the table bears the weight. The fingers hold at `grip_height` on the
     axis; a moment about the line across the gel is taken up by more of the weight on one finger.
@@ -334,8 +334,8 @@ def load(state: State, setup: Setup, task: Task, *, shocks: bool = True) -> Load
     side = weight * s * sideward
     onto = weight * s * inward
     couple = (arm * inward * down + rise * onto) / (2 * setup.radius)
-    shear = jnp.stack([setup.share * side, setup.share * down + couple])
-    twist = setup.share * (arm * sideward * down + rise * side)
+    shear = jnp.stack([setup.fraction * side, setup.fraction * down + couple])
+    twist = setup.fraction * (arm * sideward * down + rise * side)
     seconds = state.steps / task.rate
     grip = setup.grip * (1 - setup.relax * (1 - jnp.exp(-seconds / setup.relax_time)))
     normal = grip + onto / 2

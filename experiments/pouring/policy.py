@@ -43,13 +43,13 @@ class Learning:
     units.
 
     Features (`pooling` as in `Encoder.embed`) are many and gels few, which an MLP soon knows by
-    heart: it is given the first `components` principal components of its inputs, leaves out a share
-    `dropout` of them and of its hidden units at every step (Srivastava et al. 2014), and the
-    weights are kept that did best on a share `held_out` of the demonstrations. The policy acts on
-    the mean of the log-probabilities of the last `votes` moments: one that retracts by mistake
-    cannot go back. Fine-tuning goes on for `tune_steps` on `tune_moments` of each of `tune_runs`
-    runs, at `tune_rate` (the encoder's; the MLP's is twice `rate`), which rises for a tenth of the
-    steps and then falls.
+    heart: it is given the first `components` principal components of its inputs, leaves out a
+    fraction `dropout` of them and of its hidden units at every step (Srivastava et al. 2014), and
+    the weights are kept that did best on a fraction `held_out` of the demonstrations. The policy
+    acts on the mean of the log-probabilities of the last `votes` moments: one that retracts by
+    mistake cannot go back. Fine-tuning goes on for `tune_steps` on `tune_moments` of each of
+    `tune_runs` runs, at `tune_rate` (the encoder's; the MLP's is twice `rate`), which rises for a
+    tenth of the steps and then falls.
     """
 
     steps: Count[int] = 3000
@@ -110,14 +110,14 @@ def demonstrate(
     if side is None:
         return plain
     # Runs of like length together: a batch is drawn until its longest has ended. One array, since
-    # films are large.
+    # videos are large.
     frames = np.zeros((*plain.actions.shape, side, side, 3), np.uint8)
     order = np.argsort(plain.steps, kind="stable")
     for start in range(0, count, chunk):
         part = order[start : start + chunk]
         some: Setup = jax.tree.map(lambda x, part=part: x[part], setups)
         shown = run(
-            task, some, keys[part], Replay(plain.actions[:, part]), side=side, film=len(part)
+            task, some, keys[part], Replay(plain.actions[:, part]), side=side, video=len(part)
         )
         assert shown.frames is not None
         frames[: len(shown.frames), part] = shown.frames
@@ -143,7 +143,7 @@ def features(
     cylinder; the others are 0.
     """
     if trials.frames is None:
-        raise UserError("these demonstrations have no frames; record them with a picture size")
+        raise UserError("these demonstrations have no frames; record them with an image size")
     wanted = trials.taken[FRAMES - 1 :].copy()
     if learned is not None:
         wanted[1:LIFTED], wanted[LIFTED + 1 :] = False, (wanted[LIFTED:] & learned)[1:]
@@ -217,8 +217,8 @@ def input_table(z: Array) -> Array:
 
 
 def forward(head: Head, x: Any, dropout: float = 0.0, key: jax.Array | None = None) -> jax.Array:
-    """Logits (n, 3) of the actions; with a `key`, a share `dropout` of what each layer is given is
-    left out.
+    """Logits (n, 3) of the actions; with a `key`, a fraction `dropout` of what each layer is given
+    is left out.
     """
 
     def layer(number: int, x: jax.Array) -> jax.Array:
@@ -570,7 +570,7 @@ def logits_of(
     runs, count = clips.shape[:2]
     flat = clips.reshape(runs * count, *clips.shape[2:])
     rows = jnp.full(len(flat), sensor, jnp.int32)
-    z = touch_features(params["encoder"], flat, rows, net=net, pooling=pooling, join="mean")
+    z = touch_features(params["encoder"], flat, rows, net=net, pooling=pooling, aggregation="mean")
     z = z.reshape(runs, count, -1)
     before = z[:, 2:-1]
     now = z[:, 3:]

@@ -68,7 +68,7 @@ def write(folder: Path, trials: Trials, task: Task, *, held_out: float = 0.25) -
     import cv2
 
     if trials.frames is None:
-        raise UserError("these demonstrations have no frames; record them with a picture size")
+        raise UserError("these demonstrations have no frames; record them with an image size")
     rows: list[dict[str, Any]] = []
     if len(trials.steps) < 2:
         raise UserError("one run is too few: of two or more, some are kept for the test")
@@ -185,12 +185,12 @@ def _frame(table: Manifest, side: int, row: int) -> Array:
 
 
 class Agreement(NamedTuple):
-    """How a policy follows the hand on runs that it did not learn: the share of moments with the
+    """How a policy follows the hand on runs that it did not learn: the fraction of moments with the
     same action (mean of runs), the mean share over the three actions, and |moment of turning back -
     the hand's| in s (median of runs).
     """
 
-    share: float
+    fraction: float
     balanced: float
     turn: float
 

@@ -2,7 +2,7 @@
 GelSight Mini.
 
 A run's contact is solved once: the dent at a few forces, and the skin's motion for unit loads while
-everything sticks. A frame then is a weighted sum and a picture, so that any frame of a run can be
+everything sticks. A frame then is a weighted sum and an image, so that any frame of a run can be
 drawn alone. Mindlin's law adds what the slipping rim gives way. `sim.shear.shear_step` with its
 history is what this is tested against.
 """
@@ -34,8 +34,8 @@ STICKS = 1e4  # a coefficient of friction at which nothing slips
 class Grasp(NamedTuple):
     """How the gel of one run answers: `dents` (L, h, w) mm at normal `forces` (L,) N; `moves` (3,
     h, w, 2) mm of the skin for 1 N along x, 1 N along y (in the gel's own frame) and 1 N mm of
-    twist; `radius` mm of the contact for a twist's share of the friction; `behind` (3, H, W), the
-    untouched picture.
+    twist; `radius` mm of the contact for a twist's fraction of the friction; `behind` (3, H, W),
+    the untouched image.
     """
 
     dents: Array
@@ -64,7 +64,7 @@ def surface(setup: Setup) -> Array:
 
 
 def hold(setup: Setup, side: int) -> tuple[Grasp, PressResult]:
-    """The gel's answers in one run, for pictures of `side` pixels, and the contact under the
+    """The gel's answers in one run, for images of `side` pixels, and the contact under the
     grip.
     """
     gel = unit_gel(SENSOR, setup.unit)
@@ -79,7 +79,7 @@ def hold(setup: Setup, side: int) -> tuple[Grasp, PressResult]:
     middle = jax.tree.map(lambda x: x[1], result)
     area = mechanics.area(middle.pressure, PITCH)
     moves = unit_moves(middle, gel)
-    shape = optics.picture_size(SENSOR, side)
+    shape = optics.image_size(SENSOR, side)
     behind = optics.backdrop(SENSOR, setup.unit, shape)
     return Grasp(result.displacement, result.force, moves, jnp.sqrt(area / jnp.pi), behind), middle
 
@@ -105,7 +105,7 @@ def skin(grasp: Grasp, setup: Setup, load: Load) -> tuple[Array, Array]:
     """The gel under a load: dent (h, w) mm and tangential displacement (h, w, 2) mm of the skin.
 
     The slipping rim lets go further than sticking would by Mindlin's (1949) factor, 3/2 (1 - (1 -
-    q)^(2/3)) / q at the share q of the friction limit, which full slip ends.
+    q)^(2/3)) / q at the fraction q of the friction limit, which full slip ends.
     """
     place = jnp.interp(load.normal, grasp.forces, jnp.arange(len(LEVELS), dtype=jnp.float32))
     weights = jnp.maximum(1 - jnp.abs(place - jnp.arange(len(LEVELS))), 0)
@@ -124,11 +124,11 @@ def skin(grasp: Grasp, setup: Setup, load: Load) -> tuple[Array, Array]:
     )
 
 
-def picture(grasp: Grasp, setup: Setup, load: Load, key: Array | None, side: int) -> Array:
+def image(grasp: Grasp, setup: Setup, load: Load, key: Array | None, side: int) -> Array:
     """The frame u8 (side, side, 3) of the whole field, squeezed to a square as the encoder's own
     transform does.
     """
-    shape = optics.picture_size(SENSOR, side)
+    shape = optics.image_size(SENSOR, side)
     dent, moved = skin(grasp, setup, load)
     image = optics.render(
         dent, moved, PITCH, SENSOR, setup.unit, key, resolution=shape, behind=grasp.behind

@@ -139,7 +139,7 @@ def _recorded(options: Pour, encoder: Encoder, out: Path, about: dict[str, Any])
         "turns back, off by (median)",
     )
     cells = [
-        (k, f"{100 * a.share:.1f} %", f"{100 * a.balanced:.1f} %", f"{a.turn:.1f} s")
+        (k, f"{100 * a.fraction:.1f} %", f"{100 * a.balanced:.1f} %", f"{a.turn:.1f} s")
         for k, a in rows.items()
     ]
     print(markdown_table(head, cells))
@@ -156,7 +156,7 @@ def _simulated(options: Pour, encoder: Encoder, out: Path, about: dict[str, Any]
     log(f"the expert pours {options.demos} times")
     demonstrations = policy.demonstrate(task, options.seed, options.demos, side=side)
     learned, learning = _learn(options, encoder, demonstrations, trials.SENSOR)
-    rivals: dict[str, trials.Controller] = {
+    negatives: dict[str, trials.Controller] = {
         "blind": bounds.learn_blind(task, options.seed, options.demos, learning),
         "expert": trials.Expert(task),
     }
@@ -168,7 +168,7 @@ def _simulated(options: Pour, encoder: Encoder, out: Path, about: dict[str, Any]
     ]
     print(markdown_table(("trial", "poured, g", "error, g"), cells))
     results = {"touch": tried} | {
-        k: trials.run(task, setups, keys, rival) for k, rival in rivals.items()
+        k: trials.run(task, setups, keys, rival) for k, rival in negatives.items()
     }
     for name, one in results.items():
         result = trials.error(one.poured, task.target)

@@ -167,14 +167,14 @@ class Study:
         setups, keys = trials.draw_runs(TASK, seed + policy.UNSEEN, self.options.trials)
         shown = lru_cache(1)(lambda side: policy.demonstrate(TASK, seed, count, side=side))
         grasps = cache(lambda side: trials.hold(setups, side=side))
-        rivals = {
+        negatives = {
             "blind": lambda: bounds.learn_blind(TASK, seed, count, learning),
             "load": lambda: bounds.Scales(
                 TASK, setups, bounds.learn_loads(TASK, seed, count, learning)
             ),
             "expert": lambda: trials.Expert(TASK),
         }
-        for name, make in rivals.items():
+        for name, make in negatives.items():
             if self.wanted(name, "bound", seed, name):
                 since = time.time()
                 self.write(name, "bound", seed, trials.run(TASK, setups, keys, make()), name, since)

@@ -22,7 +22,7 @@ TITLES = {
     "static": "AnyTouch, static only",
     "anytouch": "AnyTouch",
     "blind": "blind: time and own actions",
-    "load": "bound: knows the load, sees no picture",
+    "load": "bound: knows the load, sees no image",
     "expert": "expert: sees the scales",
 }
 # of the run `anytouch` in place of one trained on stills: says nothing of such training

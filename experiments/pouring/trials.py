@@ -133,7 +133,7 @@ def _advance(state: State, actions: jax.Array, setups: Setup, *, task: Task) -> 
 
 
 def hold(setups: Setup, *, side: int) -> render.Grasp:
-    """The grasps of stacked runs, for pictures of `side` pixels."""
+    """The grasps of stacked runs, for images of `side` pixels."""
     render.prepare()
     return _hold(setups, side=side)
 
@@ -149,7 +149,7 @@ def look(state: State, setups: Setup, grasps: render.Grasp, *, task: Task, side:
 
     def one(state: State, setup: Setup, grasp: render.Grasp) -> jax.Array:
         noise = jax.random.fold_in(state.key, physics.PIXELS)
-        return render.picture(grasp, setup, physics.load(state, setup, task), noise, side)
+        return render.image(grasp, setup, physics.load(state, setup, task), noise, side)
 
     return jax.vmap(one)(state, setups, grasps)
 
@@ -161,20 +161,20 @@ def run(
     controller: Controller,
     *,
     side: int = 112,
-    film: int = 0,
+    video: int = 0,
     late: Array | None = None,
     grasps: render.Grasp | None = None,
 ) -> Trials:
     """Run the batch to its end under `controller`; frames are drawn only if it looks at them, or to
-    `film` runs.
+    `video` runs.
 
-    `film`: of so many runs, the first ones, the frames are kept.
+    `video`: of so many runs, the first ones, the frames are kept.
 
     `grasps`: those of `hold` for these runs and `side`, where they are at hand. `late` (B,): a hand
     that goes on pouring for so many moments after the controller retracts, which then stays the
     choice. So demonstrations show what to do where the target is already passed.
     """
-    drawn = controller.looks or film > 0
+    drawn = controller.looks or video > 0
     if drawn and grasps is None:
         grasps = hold(setups, side=side)
     state = _begin(setups, keys, task=task)
@@ -198,13 +198,13 @@ def run(
             (choices, actions, *jax.device_get((state.mass, jnp.rad2deg(state.tilt), state.rate)))
         )
         steps += ~np.asarray(state.done)
-        if shown is not None and film:
-            frames.append(shown[:film].copy())
+        if shown is not None and video:
+            frames.append(shown[:video].copy())
         state = _advance(state, actions, setups, task=task)
     choices, actions, mass, tilt, rate = (np.stack(one) for one in zip(*history, strict=True))
     out = np.asarray(physics.poured(state, task))
     return Trials(
-        out, steps, choices, actions, mass, tilt, rate, np.stack(frames) if film else None
+        out, steps, choices, actions, mass, tilt, rate, np.stack(frames) if video else None
     )
 
 

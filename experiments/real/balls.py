@@ -7,7 +7,7 @@ unit itself.
 A ball of known radius R that touches the gel in a circle of radius a has the profile sqrt(R^2 -
 r^2) - sqrt(R^2 - a^2) above the rim of its contact. The circle is detected in the difference from
 the untouched gel (`find_circle`). So depth is compared with the rim's: what the gel does outside
-the contact is not known. `--picture` draws real and simulated presses, and their colours by slope.
+the contact is not known. `--image` draws real and simulated presses, and their colours by slope.
 
 `--calibration` is what the field does for one unit: slopes of the ball are fitted to colours and
 places on half of the presses, by a polynomial or a small network, and integrated (Poisson). The
@@ -49,11 +49,11 @@ from experiments.records import write_record
 Array = npt.NDArray[Any]
 FOLDER = Path("../shared/real_touch")
 _ANGLES = np.linspace(0, 2 * np.pi, 60, endpoint=False).astype(np.float32)
-_WIDTH = 320  # pixels of the picture in which circles are sought
+_WIDTH = 320  # pixels of the image in which circles are sought
 _INNER = 0.9  # of the circle's radius: the part that the sphere is fitted to
 _PIXELS = 800  # of each press inside its circle, and as many outside
 DRAWS = 1000  # of a bootstrap over presses
-_SHOWN = 3  # presses in the picture
+_SHOWN = 3  # presses in the image
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class BallOptions:
 
     models: Positional[tuple[str, ...]] = ()  # Encoders that measure.
     calibration: bool = False  # Also the calibration of the unit itself.
-    picture: Path | None = None  # PNG of real and simulated presses.
+    image: Path | None = None  # PNG of real and simulated presses.
     data: Path = FOLDER  # Folder of the presses.
     out: Path = Path("experiments/results/balls.jsonl")  # JSON lines.
 
@@ -70,13 +70,13 @@ class BallOptions:
 class Unit(NamedTuple):
     """Presses of balls on one unit.
 
-    `width_mm` is what the width of its pictures shows, None if nobody says it.
+    `width_mm` is what the width of its images shows, None if nobody says it.
     """
 
     name: str
     sensor: str
     gel: str
-    # radius of the ball in mm (NaN: unknown), and the pattern of its pictures
+    # radius of the ball in mm (NaN: unknown), and the pattern of its images
     presses: dict[float, str]
     width_mm: float | None
     # pixels of a contact circle at least and at most, or None: it has no sharp rim
@@ -125,7 +125,7 @@ UNITS = (
 
 
 class Press(NamedTuple):
-    """A press of a ball of radius `ball` mm: the picture and its contact circle in pixels."""
+    """A press of a ball of radius `ball` mm: the image and its contact circle in pixels."""
 
     name: str
     frame: Array
@@ -136,7 +136,7 @@ class Press(NamedTuple):
 
     @property
     def is_whole(self) -> bool:
-        """Whether the circle lies in the picture."""
+        """Whether the circle lies in the image."""
         height, width = self.frame.shape[:2]
         return bool(self.radius <= min(self.x, self.y, width - 1 - self.x, height - 1 - self.y))
 
@@ -166,7 +166,7 @@ def find_circle(change: Array, radii: tuple[float, float] | None) -> tuple[float
     most.
 
     After Daugman (1993): the jump is averaged along the circle, of which a third must lie in the
-    picture. Without `radii` in pixels it is `find_disc`.
+    image. Without `radii` in pixels it is `find_disc`.
     """
     if radii is None:
         return find_disc(change)
@@ -247,8 +247,8 @@ def true_depth(press: Press, mm: float) -> Array:
 
 
 class Error(NamedTuple):
-    """Errors of a press: radius of the ball as a share, depth of its centre and of its profile over
-    the rim in mm.
+    """Errors of a press: radius of the ball as a fraction, depth of its centre and of its profile
+    over the rim in mm.
     """
 
     radius: float
@@ -412,7 +412,7 @@ def interval(values: Array) -> list[float]:
 
 
 def record_of(depths: Sequence[Array], presses: Sequence[Press], mm: float) -> dict[str, Any]:
-    """Return medians with intervals of the errors on presses whose circle lies in the picture, and
+    """Return medians with intervals of the errors on presses whose circle lies in the image, and
     those of each.
     """
     whole = [n for n, press in enumerate(presses) if press.is_whole]
@@ -504,8 +504,8 @@ def run(options: BallOptions) -> int:
     for unit in UNITS:
         gel, presses = read_presses(unit, options.data)
         known = all(np.isfinite(list(unit.presses)))
-        if known and options.picture is not None:
-            draw_colours(options.picture, unit, gel, [press for press in presses if press.is_whole])
+        if known and options.image is not None:
+            draw_colours(options.image, unit, gel, [press for press in presses if press.is_whole])
         mm = (unit.width_mm or 0.0) / gel.shape[1]
         records = dict[str, dict[str, Any]]()
         if known and options.calibration:

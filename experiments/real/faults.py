@@ -1,4 +1,4 @@
-"""Faults of sensor units, made from good ones by simple operations on their pictures."""
+"""Faults of sensor units, made from good ones by simple operations on their images."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Fault = Callable[[UnitFrames, UnitFrames | None, np.random.Generator], UnitFrame
 def each(
     unit: UnitFrames, change: Callable[[np.ndarray], np.ndarray], *, background: bool = True
 ) -> UnitFrames:
-    """Return the unit with every picture changed, that of the untouched gel too if `background`."""
+    """Return the unit with every image changed, that of the untouched gel too if `background`."""
     recordings = [
         [np.ascontiguousarray(change(frame)) for frame in recording]
         for recording in unit.recordings
@@ -153,10 +153,10 @@ FAULTS: dict[str, tuple[str, Fault]] = {
 
 
 def most_different(unit: UnitFrames, units: Sequence[UnitFrames]) -> UnitFrames | None:
-    """Return the other unit of the same sensor and size whose usual picture differs most, None
+    """Return the other unit of the same sensor and size whose usual image differs most, None
     without one.
     """
-    rivals = [
+    negatives = [
         other
         for other in units
         if other is not unit
@@ -164,5 +164,7 @@ def most_different(unit: UnitFrames, units: Sequence[UnitFrames]) -> UnitFrames 
         and other.frames[0].shape == unit.frames[0].shape
     ]
     return max(
-        rivals, key=lambda other: float(cv2.absdiff(other.usual, unit.usual).mean()), default=None
+        negatives,
+        key=lambda other: float(cv2.absdiff(other.usual, unit.usual).mean()),
+        default=None,
     )

@@ -22,7 +22,13 @@ def encoder_features(encoder: Encoder, data: Recordings, sensor: str | None = No
     rows = np.arange(len(data.manifest))
     row = None if sensor is None else encoder.sensor_row(sensor)
     x = embed_rows(
-        encoder, data.manifest, rows, pooling="both", sensor_row=row, gels=data.gels, log=silent
+        encoder,
+        data.manifest,
+        rows,
+        pooling="both",
+        sensor_row=row,
+        backgrounds=data.backgrounds,
+        log=silent,
     )[1]
     fit = x[data.split == "train"]
     return np.asarray((x - fit.mean(0)) / (fit.std(0) + 1e-6), np.float32)
@@ -33,8 +39,8 @@ def pixel_values(data: Recordings) -> np.ndarray:
     gel.
     """
 
-    def small(picture: np.ndarray) -> np.ndarray:
-        return cv2.resize(picture, (32, 24), interpolation=cv2.INTER_AREA).astype(np.float32) / 255
+    def small(image: np.ndarray) -> np.ndarray:
+        return cv2.resize(image, (32, 24), interpolation=cv2.INTER_AREA).astype(np.float32) / 255
 
     pairs = ((small(frame), small(gel)) for frame, gel in data.pairs())
     return components(
@@ -51,7 +57,7 @@ def components(values: list[np.ndarray], data: Recordings, count: int = 200) -> 
 
 def classical_values(data: Recordings) -> np.ndarray:
     """Return histograms of oriented gradients and of local binary patterns of the difference
-    picture.
+    image.
     """
     hog = cv2.HOGDescriptor((96, 96), (32, 32), (32, 32), (16, 16), 9)
     values = []

@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from anytouch_jax.data.background.rule import UnitGels
+from anytouch_jax.data.background.rule import Backgrounds
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest, replace_column, select_rows
@@ -38,9 +38,9 @@ class Recordings:
     data: str = field(default="")
 
     @cached_property
-    def gels(self) -> UnitGels:
+    def backgrounds(self) -> Backgrounds:
         """The untouched gel of every frame."""
-        return UnitGels(self.manifest)
+        return Backgrounds(self.manifest)
 
     @cached_property
     def names(self) -> np.ndarray:
@@ -49,18 +49,18 @@ class Recordings:
 
     def pairs(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Yield every frame u8 RGB (h, w, 3) with its untouched gel."""
-        gel = self.gels.shared(lambda picture: picture)
+        gel = self.backgrounds.shared(lambda image: image)
         for row in range(len(self.manifest)):
-            picture = gel(row)
-            assert picture is not None
-            yield decode(self.manifest.file(row)), picture
+            image = gel(row)
+            assert image is not None
+            yield decode(self.manifest.file(row)), image
 
 
 def read(path: str | Path, untouched: Untouched = "rule") -> Recordings:
     """Read all rows of the gripper from the manifest of the pack. Raises UserError.
 
     `untouched`: what is taken for the untouched gel. "rule" is that of the package, the unit's own
-    picture, or the median of its frames. "median" is this median everywhere, and "first frame" that
+    image, or the median of its frames. "median" is this median everywhere, and "first frame" that
     of the recording.
     """
     whole = manifests.read(path)

@@ -6,7 +6,7 @@ baseline.
 
 Each model is a name, a run folder or a weights file; `untrained:MODEL` is the same network without
 training. Every row goes to `experiments/results/real.jsonl`. `make results` makes the page from
-that file alone. `--untouched median` does without the pictures of the untouched gel, and
+that file alone. `--untouched median` does without the images of the untouched gel, and
 `--untouched "first frame"` takes the first frame of a recording for it.
 """
 
@@ -39,7 +39,7 @@ def load(name: str) -> Encoder:
 def task_record(score: scores.Score) -> dict[str, Any]:
     """Return a score as it stands in a record."""
     return {
-        "share": score.share,
+        "fraction": score.fraction,
         "interval": score.interval(),
         "option": score.option,
         "correct": score.correct.astype(int).tolist(),
@@ -71,7 +71,9 @@ def main() -> None:
         tasks = {task: task_record(score) for task, score in found.items()}
         write_record(options.out / "real.jsonl", name + end, about | {"tasks": tasks})
         print(
-            name + end, {task: round(score.share, 3) for task, score in found.items()}, flush=True
+            name + end,
+            {task: round(score.fraction, 3) for task, score in found.items()},
+            flush=True,
         )
 
     write("pixels", scores.table(features.pixel_values(data), data), kind="baseline")
@@ -86,9 +88,9 @@ def main() -> None:
         found = scores.table(features.encoder_features(encoder, data), data)
         write(word.partition("=")[0], found, kind="encoder", fingerprint=encoder.fingerprint)
     if options.trained:
-        pictures = training.cnn_pictures(data)
+        images = training.cnn_images(data)
         found = {
-            f"{task}, {scores.TRAINED}": score(pictures, data, training.cnn_scores)
+            f"{task}, {scores.TRAINED}": score(images, data, training.cnn_scores)
             for task, score in scores.TASKS.items()
         }
         write(CNN, found, kind="baseline")

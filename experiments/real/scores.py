@@ -31,7 +31,7 @@ class Score(NamedTuple):
     option: float
 
     @property
-    def share(self) -> float:
+    def fraction(self) -> float:
         return float(self.correct.mean())
 
     def interval(self) -> tuple[float | None, float | None]:
@@ -67,7 +67,7 @@ def linear_scores(
 def neighbour_scores(
     x: Array, y: Array, classes: int, fit: Array, weights: Array
 ) -> list[tuple[float, Array]]:
-    """Return (k, shares of the classes among the k nearest train frames (n, classes))."""
+    """Return (k, fractions of the classes among the k nearest train frames (n, classes))."""
     centred = x - x[fit].mean(0)
     unit = centred / np.maximum(np.linalg.norm(centred, axis=1, keepdims=True), 1e-12)
     near, cosine = nearest(unit[fit], unit, max(NEIGHBOURS))
@@ -80,7 +80,7 @@ def neighbour_scores(
     return results
 
 
-def _share_weights(groups: Array) -> Array:
+def _fraction_weights(groups: Array) -> Array:
     """Return weights of frames by which every recording counts once."""
     _, inverse, counts = np.unique(groups, return_inverse=True, return_counts=True)
     return 1.0 / counts[inverse]
@@ -98,7 +98,7 @@ def recording_score(
     (n,).
     """
     fit = np.flatnonzero(split == "train")
-    options = score(x, y, classes, fit, _share_weights(groups[fit]))
+    options = score(x, y, classes, fit, _fraction_weights(groups[fit]))
 
     def rights(values: Array, part: Array) -> tuple[Array, Array, float]:
         names = np.unique(groups[part])

@@ -29,7 +29,7 @@ SHIFT = 0.06  # of a side
 
 
 class SmallCnn(nnx.Module):
-    """Four convolutions of stride 2, each with a layer norm, their mean over the picture, and a
+    """Four convolutions of stride 2, each with a layer norm, their mean over the image, and a
     linear head.
     """
 
@@ -49,13 +49,13 @@ class SmallCnn(nnx.Module):
         self.head = nnx.Linear(before, classes, rngs=rngs)
 
     def __call__(self, x: jax.Array) -> jax.Array:
-        """Return logits (B, classes) of pictures (B, SIDE, SIDE, 6)."""
+        """Return logits (B, classes) of images (B, SIDE, SIDE, 6)."""
         for convolution, norm in zip(self.convolutions, self.norms, strict=True):
             x = nnx.gelu(norm(convolution(x)))
         return self.head(x.mean((1, 2)))
 
 
-def cnn_pictures(data: Recordings) -> Array:
+def cnn_images(data: Recordings) -> Array:
     """Return frames and their differences from the untouched gel, u8 (n, SIDE, SIDE, 6)."""
     both = (
         np.concatenate([frame, subtract_background([frame], gel)[0]], -1)
@@ -67,7 +67,7 @@ def cnn_pictures(data: Recordings) -> Array:
 def cnn_scores(
     x: Array, y: Array, classes: int, fit: Array, weights: Array
 ) -> list[tuple[float, Array]]:
-    """Train a `SmallCnn` on the rows `fit` of `cnn_pictures`, drawn by `weights`.
+    """Train a `SmallCnn` on the rows `fit` of `cnn_images`, drawn by `weights`.
 
     Return (epochs, probabilities (n, classes)) after each number of EPOCHS.
     """
@@ -76,20 +76,20 @@ def cnn_scores(
     schedule = optax.warmup_cosine_decay_schedule(0.0, RATE, steps, steps * EPOCHS[-1], 0.1 * RATE)
     optimiser = optax.adamw(schedule, weight_decay=0.05)
 
-    def logits(params: Any, pictures: jax.Array) -> jax.Array:
-        return nnx.merge(graph, params)((pictures.astype(jnp.float32) - 128) / 64)
+    def logits(params: Any, images: jax.Array) -> jax.Array:
+        return nnx.merge(graph, params)((images.astype(jnp.float32) - 128) / 64)
 
     @jax.jit
-    def step(params: Any, state: Any, pictures: jax.Array, labels: jax.Array) -> tuple[Any, Any]:
+    def step(params: Any, state: Any, images: jax.Array, labels: jax.Array) -> tuple[Any, Any]:
         def loss(params: Any) -> jax.Array:
             return optax.softmax_cross_entropy_with_integer_labels(
-                logits(params, pictures), labels
+                logits(params, images), labels
             ).mean()
 
         updates, state = optimiser.update(jax.grad(loss)(params), state, params)
         return optax.apply_updates(params, updates), state
 
-    predict = jax.jit(lambda params, pictures: jax.nn.softmax(logits(params, pictures)))
+    predict = jax.jit(lambda params, images: jax.nn.softmax(logits(params, images)))
     state = optimiser.init(params)
     rng = np.random.default_rng(0)
     results = []
@@ -102,10 +102,10 @@ def cnn_scores(
     return results
 
 
-def _shifted(pictures: Array, rng: np.random.Generator) -> Array:
-    """Return pictures moved by up to SHIFT of their side, with the border repeated."""
-    most = round(SHIFT * pictures.shape[1])
-    moves = rng.integers(-most, most + 1, (len(pictures), 2))
-    rows = np.clip(np.arange(pictures.shape[1])[None] + moves[:, :1], 0, pictures.shape[1] - 1)
-    columns = np.clip(np.arange(pictures.shape[2])[None] + moves[:, 1:], 0, pictures.shape[2] - 1)
-    return pictures[np.arange(len(pictures))[:, None, None], rows[:, :, None], columns[:, None, :]]
+def _shifted(images: Array, rng: np.random.Generator) -> Array:
+    """Return images moved by up to SHIFT of their side, with the border repeated."""
+    most = round(SHIFT * images.shape[1])
+    moves = rng.integers(-most, most + 1, (len(images), 2))
+    rows = np.clip(np.arange(images.shape[1])[None] + moves[:, :1], 0, images.shape[1] - 1)
+    columns = np.clip(np.arange(images.shape[2])[None] + moves[:, 1:], 0, images.shape[2] - 1)
+    return images[np.arange(len(images))[:, None, None], rows[:, :, None], columns[:, None, :]]

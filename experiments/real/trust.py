@@ -182,16 +182,16 @@ def calibration_record(data: Touches, options: TrustOptions) -> dict[str, Any]:
         1 / np.unique(groups, return_counts=True)[1][np.unique(groups, return_inverse=True)[1]]
     )
 
-    def share(
+    def fraction(
         name: str,
     ) -> list[float]:  # a recording has the same weight, however many frames it has
         return over_groups(lambda i: float(np.average(whole[name][i], weights=weights[i])), groups)
 
     return {
-        "accuracy": share("right"),
-        "coverage": share("covered"),
-        "novel": share("novel"),
-        "decided": share("sure"),
+        "accuracy": fraction("right"),
+        "coverage": fraction("covered"),
+        "novel": fraction("novel"),
+        "decided": fraction("sure"),
         "ece": over_groups(lambda i: error(whole["p"][i], right[i]), groups),
         "size": float(whole["size"].mean()),
         "classes": len(np.unique(data.y)),
@@ -238,7 +238,7 @@ def classes_never_met(data: Touches, options: TrustOptions) -> dict[str, list[fl
 
 
 def sensors_never_met(data: Touches, options: TrustOptions) -> dict[str, dict[str, Any]]:
-    """Return the AUROC and the share called novel of each sensor that the head never met."""
+    """Return the AUROC and the fraction called novel of each sensor that the head never met."""
     fit, val, test = random_split(data.groups, 0)
     head = fitted(data, fit, val, options)
     other = read_arrays(options.strange or "")
@@ -267,7 +267,7 @@ def sensors_never_met(data: Touches, options: TrustOptions) -> dict[str, dict[st
 
 
 def thinned(unit: health.UnitFrames) -> health.UnitFrames:
-    """Return the unit with some nine recordings of two frames: faults of all pictures take
+    """Return the unit with some nine recordings of two frames: faults of all images take
     minutes.
     """
     step = max(1, len(unit.recordings) // 8)
@@ -275,23 +275,23 @@ def thinned(unit: health.UnitFrames) -> health.UnitFrames:
 
 
 def health_record(
-    units: Sequence[health.UnitFrames], gels: Mapping[str, list[Array]]
+    units: Sequence[health.UnitFrames], backgrounds: Mapping[str, list[Array]]
 ) -> dict[str, Any]:
     """Return false alarms on the units, and {fault: [reported, made, undecided]} of faults made
     from each.
 
-    `gels` are pictures of more untouched gels by sensor.
+    `backgrounds` are images of more untouched gels by sensor.
     """
     alarms = [
         f"{result.sensor} {result.unit}: {check.name} ({check.value})"
-        for result in health.check_units(units, gels)
+        for result in health.check_units(units, backgrounds)
         for check in result.faults
     ]
     units = [thinned(unit) for unit in units]
     counts = {fault: [0, 0, 0] for fault in FAULTS}
     for unit in units:
         others = [other for other in units if other.sensor == unit.sensor and other is not unit]
-        references = [*gels.get(unit.sensor, ()), *(other.untouched() for other in others)]
+        references = [*backgrounds.get(unit.sensor, ()), *(other.untouched() for other in others)]
         good = {check.name for check in health.examine(unit, references, others).checks if check.ok}
         for fault, (name, make) in FAULTS.items():
             other = most_different(unit, units)
@@ -314,9 +314,9 @@ def run(options: TrustOptions) -> int:
             if not any(word in unit.unit for word in options.skip_units)
         ]
         real = [sensor for sensor in SENSORS.values() if options.package and sensor.real]
-        gels = {sensor.name: list((255 * bases(sensor)).astype("uint8")) for sensor in real}
+        backgrounds = {sensor.name: list((255 * bases(sensor)).astype("uint8")) for sensor in real}
         kind = "health"
-        record = health_record(units, gels)
+        record = health_record(units, backgrounds)
     elif options.features is not None:
         data = read_touches(options)
         kind = "trust"

@@ -33,12 +33,14 @@ def cut(
     return path
 
 
-def mark(folder: Path, share: float) -> None:
+def mark(folder: Path, fraction: float) -> None:
     """Write the simulated manifest as WHOLE, with `label.contact`: which frames are touched
     (`anytouch contact`).
     """
     table = manifests.read(folder / MADE)
-    manifests.write(mark_contact(table, contact_scores(table), share=share)[0], folder / WHOLE)
+    manifests.write(
+        mark_contact(table, contact_scores(table), fraction=fraction)[0], folder / WHOLE
+    )
 
 
 def cut_all(folder: Path) -> None:

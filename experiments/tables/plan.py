@@ -49,13 +49,13 @@ class Size:
 
     Towers from scratch learn nothing in minutes from matching one pair against one other, as the
     paper does on CLIP's weights. So `match_head` is "cosine", each touch against all others of the
-    batch, on a share `match_keep` of the patches and weighed by `match_weight`, all of a step's
+    batch, on a fraction `match_keep` of the patches and weighed by `match_weight`, all of a step's
     touches to be found by one sensor (`negatives`), so that the sensor is no clue; only frames in
-    contact are drawn, those with a share `contact` of the strongest of their recording (`anytouch
-    data contact`), as the paper's are contact frames; a row of question q2 has the paper's head.
-    The softmax starts mild (`temperature`): a sharp one only punishes untrained towers. Touches are
-    background-subtracted, and their colours are not jittered, since colours show slopes. `seeds`
-    are those of questions whose sign is claimed; the others take the first.
+    contact are drawn, those with a fraction `contact` of the strongest of their recording
+    (`anytouch data contact`), as the paper's are contact frames; a row of question q2 has the
+    paper's head. The softmax starts mild (`temperature`): a sharp one only punishes untrained
+    towers. Touches are background-subtracted, and their colours are not jittered, since colours
+    show slopes. `seeds` are those of questions whose sign is claimed; the others take the first.
     """
 
     name: str = "full"

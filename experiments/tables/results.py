@@ -28,7 +28,7 @@ class Run:
     seed: int
     about: Mapping[str, Any]
 
-    def row(self, column: Column, protocol: str = "honest") -> Mapping[str, Any] | None:
+    def row(self, column: Column, protocol: str = "grouped") -> Mapping[str, Any] | None:
         """The row of a column, if it was measured."""
         for one in self.about["rows"]:
             key = one["view"], one["task"], one["metric"], one["protocol"]

@@ -49,8 +49,8 @@ _GREY = (0, 128, 255)
 class Fit:
     """How a translation is trained.
 
-    `adversarial`: weight of the critic's verdict added to the mean squared error, as a share of the
-    error of copying the mean target, so that it means the same in every unit; 0 for no critic.
+    `adversarial`: weight of the critic's verdict added to the mean squared error, as a fraction of
+    the error of copying the mean target, so that it means the same in every unit; 0 for no critic.
     `penalty`: on the critic's slope at real touches (R1, on features), which keeps the two in step.
     `tune` fine also trains the encoders, at a tenth of the rate.
     """

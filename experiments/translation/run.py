@@ -49,7 +49,7 @@ class Translate:
     target: str = "duragel"
     """Sensor to translate to."""
     background: Path | None = None
-    """Picture of the untouched gel, for an encoder trained on background-subtracted frames."""
+    """Image of the untouched gel, for an encoder trained on background-subtracted frames."""
     out: Path | None = None
     """File or folder to write (default: the folder of each image). With --fit, the folder of the
     translation.

@@ -29,7 +29,7 @@ def shared(about: Mapping[str, Any]) -> dict[str, Any]:
     """Return what the settings of runs must share by name: the view of a touch, an encoder a seed,
     pairs a task.
 
-    Errors of pictures of another size are no rivals.
+    Errors of images of another size are no rivals.
     """
     task = f"{about['from']} to {about['to']}"
     fit = about["fit"]

@@ -80,7 +80,7 @@ class Options:
 
 
 def view_of(encoder: Encoder) -> tuple[int, bool]:
-    """Return the picture size of an encoder, and whether it subtracts the background."""
+    """Return the image size of an encoder, and whether it subtracts the background."""
     return encoder.config.model.image_size, encoder.subtracts
 
 

@@ -131,7 +131,7 @@ def _design(
 ) -> Design:
     """What is trained.
 
-    Raises UserError for a reference without a shape, and pictures of another size.
+    Raises UserError for a reference without a shape, and images of another size.
     """
     if shape is None:
         if encoder is None:
@@ -248,7 +248,7 @@ def whitening(tokens: np.ndarray) -> np.ndarray:
     for those of less than `_FAINT` of the largest (ZCA).
 
     An encoder's channels go together: ten of a hundred directions hold nearly all of their
-    variance, and what a picture needs in addition is learned late or never where each channel is
+    variance, and what an image needs in addition is learned late or never where each channel is
     divided by its own deviation.
     """
     flat = tokens.reshape(-1, tokens.shape[-1]).astype(np.float64)

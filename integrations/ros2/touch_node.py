@@ -7,7 +7,7 @@ ros2 run needs a package. This file runs alone:
     python integrations/ros2/touch_node.py --ros-args -p sensor:=digit
 
 Wrench and points need an encoder that measures. Their frame is the parameter frame, the optical
-frame of the camera (REP 103), which is right-handed: x to the right of the picture, y down, z away
+frame of the camera (REP 103), which is right-handed: x to the right of the image, y down, z away
 from the camera, towards the object. The wrench is that of the object on the gel, about the centre
 of pressure: a press has a negative z. The surface of the gel lies at z = 0, and at negative z where
 it is pressed.
@@ -95,7 +95,7 @@ def frames_of(values: dict[str, str]):
     encoder = at.load_encoder(values["model"])
     source, live = open_source(values["camera"])
     gel = decode(values["background"]) if values["background"] else None
-    # Without a picture of the gel, one is estimated from the frames.
+    # Without an image of the gel, one is estimated from the frames.
     preprocess = at.Preprocess(encoder, gel)
     length = 1
     measure = None
@@ -131,7 +131,7 @@ def main() -> None:
             # NaN without a background: contact is unknown, and nothing is said.
             if frame.contact == frame.contact:
                 send["contact"](Bool(data=bool(frame.contact)))
-            # Force is None if nobody knows the mm that the picture shows.
+            # Force is None if nobody knows the mm that the image shows.
             if frame.fields is not None and frame.fields.force is not None:
                 header = Header(stamp=node.get_clock().now().to_msg(), frame_id=values["frame"])
                 send["wrench"](wrench(frame.fields, header))

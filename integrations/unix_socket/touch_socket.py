@@ -22,7 +22,7 @@ def line_of(frame: Any) -> dict[str, Any]:
     if frame.estimated:
         line["background"] = "estimated"
     if frame.fields is not None:
-        # Force in N, depth in mm and others, with deviations. x is to the right of the picture, y
+        # Force in N, depth in mm and others, with deviations. x is to the right of the image, y
         # down, and force_z into the gel. Slip is None where nothing touches.
         line["fields"] = frame.fields.summary()
     return line
@@ -75,7 +75,7 @@ def main() -> None:
     encoder = at.load_encoder("anytouch-tiny")
     source, live = open_source(given.camera)
     gel = given.background and decode(given.background)
-    # Without a picture of the gel, one is estimated from the frames.
+    # Without an image of the gel, one is estimated from the frames.
     preprocess = at.Preprocess(encoder, gel)
     measured = {}
     if encoder.measures:

@@ -20,6 +20,7 @@ _HOMES = {
     "train.optim": "optimizer",
     "train.loop": "fit",
     "training": "pretrain",
+    "finetuning": "FinetuneOptions finetune",
     "sim.recorder": "simulate_touch",
     "evaluate.heads": "ProbeHead",
     "evaluate.probing": "leave_groups_out probe_benchmark probe_features probe_label probe_tasks",
@@ -46,6 +47,8 @@ __version__ = "0.3.0"
 
 
 def __getattr__(name: str) -> Any:
+    if name == "sim":  # for `anytouch_jax.sim.mujoco`, whose names are used by their room
+        return import_module("anytouch_jax.sim")
     if name not in _HOME:
         # Imported here, because only an old name or a mistake needs it. `from anytouch_jax import
         # renamed` would ask this function for it.

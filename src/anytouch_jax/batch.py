@@ -27,12 +27,12 @@ class FieldBatch(NamedTuple, Generic[A]):
     """Touches with exact fields of their last frame (h, w), free of scale.
 
     The units are those of the gel, so that one network serves sensors of any size and stiffness:
-    lengths over the width of the picture, pressure over the gel's modulus.
+    lengths over the width of the image, pressure over the gel's modulus.
 
     Attributes:
         clip: u8 (B, T, H, W, 3).
         sensor: i32 (B,), rows of the sensor table.
-        aspect: f32 (B,), logarithm of height over width of the picture.
+        aspect: f32 (B,), logarithm of height over width of the image.
         depth: f32 (B, h, w), over the width.
         shear: f32 (B, h, w, 2), over the width.
         pressure: f32 (B, h, w), over the modulus.
@@ -53,11 +53,11 @@ class FieldBatch(NamedTuple, Generic[A]):
 
 
 class FieldOutput(NamedTuple, Generic[A]):
-    """Fields (B, h, w) at half the picture's resolution, each with its deviation.
+    """Fields (B, h, w) at half the image's resolution, each with its deviation.
 
     Attributes:
-        depth: over the width of the picture.
-        shear: (..., 2) along x and y of the picture, over its width.
+        depth: over the width of the image.
+        shear: (..., 2) along x and y of the image, over its width.
         contact: logits.
         pressure: over the gel's modulus.
         depth_log: logarithms of Laplace deviations of the depth, over LENGTH of

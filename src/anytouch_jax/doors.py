@@ -27,7 +27,7 @@ class Door(NamedTuple):
 WEIGHTS = {
     "family": Door("zoo.families:load_family"),
     "family encoder": Door("zoo.encoder:family_encoder"),
-    "image encoder": Door("zoo.start:touch_of_photographs"),
+    "image encoder": Door("zoo.start:touch_of_rgb_images"),
     "torch": Door("zoo.torch_file:read_torch"),
 }
 # What reads sensor.json of a fitted sensor, a folder NAME.sensor.

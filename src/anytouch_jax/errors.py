@@ -8,15 +8,15 @@ from importlib import import_module
 from typing import Any
 
 from anytouch_jax.signals import Terminated, handled
-from anytouch_jax.text import letters_apart, shorten
+from anytouch_jax.text import edit_distance, shorten
 
 __all__ = [
     "CheckError",
     "ConfigError",
     "Terminated",
     "UserError",
+    "edit_distance",
     "handled",
-    "letters_apart",
     "shorten",
 ]
 

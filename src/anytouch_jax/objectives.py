@@ -99,7 +99,7 @@ def normalise_touch(clip: Array) -> Array:
 
 
 def normalise_image(image: Array) -> Array:
-    """Return uint8 RGB photographs (..., 3) as float32, normalised by CLIP's statistics."""
+    """Return uint8 RGB RGB images (..., 3) as float32, normalised by CLIP's statistics."""
     return _normalise(image, CLIP_MEAN, CLIP_STD)
 
 

@@ -19,8 +19,10 @@ _display: Progress | None = None
 
 
 @contextmanager
-def bar(total: int | None, words: str) -> Iterator[Callable[[int], None]]:
+def bar(total: int | None, words: str) -> Iterator[Callable[..., None]]:
     """Give a function for the number of items that are done, which moves a bar.
+
+    It may be given other words, too, such as a score.
 
     The bar appears once the work has taken WAIT seconds. Nothing is shown where the error stream
     is no terminal. A bar inside another one is shown below it.
@@ -31,7 +33,7 @@ def bar(total: int | None, words: str) -> Iterator[Callable[[int], None]]:
     """
     global _display
     if not sys.stderr.isatty():
-        yield lambda done: None
+        yield lambda done, words=None: None
         return
     outer = _display
     display = _new_display() if outer is None else outer
@@ -39,11 +41,11 @@ def bar(total: int | None, words: str) -> Iterator[Callable[[int], None]]:
     begun = time.monotonic()
     task = display.add_task(words, total=total, visible=False)
 
-    def advance(done: int | None = None) -> None:
+    def advance(done: int | None = None, words: str | None = None) -> None:
         is_long = time.monotonic() - begun >= WAIT
         if is_long:
             display.start()
-        display.update(task, completed=done, visible=is_long)
+        display.update(task, completed=done, description=words, visible=is_long)
 
     # The first item alone may take longer than WAIT.
     timer = threading.Timer(WAIT, advance)

@@ -23,7 +23,7 @@ class Markers:
     pitch: float  # mm
     radius: float  # mm
     aspect: float = 1.0  # width over height of a spot
-    share: float = 1.0  # of the units with markers
+    fraction: float = 1.0  # of the units with markers
     ink: RGB = (0.08, 0.08, 0.08)
     # lens distortion: the lattice shrinks outwards from pitch / (1 - bend) in the middle
     bend: float = 0.0
@@ -65,7 +65,7 @@ _WITH_TOKENS = (
         proportions=0.75,
         modulus_kpa=150.0,
         thickness_mm=4.0,
-        dots=Markers(pitch=1.6, radius=0.22, share=0.4),
+        dots=Markers(pitch=1.6, radius=0.22, fraction=0.4),
         contact_threshold=6.5,
     ),
     SensorRecord(
@@ -84,7 +84,7 @@ _WITH_TOKENS = (
         modulus_kpa=220.0,
         thickness_mm=2.0,
         dots=Markers(
-            pitch=1.25, radius=0.13, aspect=2.6, share=0.5, ink=(0.12, 0.14, 0.2), bend=0.12
+            pitch=1.25, radius=0.13, aspect=2.6, fraction=0.5, ink=(0.12, 0.14, 0.2), bend=0.12
         ),
         contact_threshold=6.5,
     ),
@@ -95,7 +95,7 @@ _WITH_TOKENS = (
         proportions=0.75,
         modulus_kpa=180.0,
         thickness_mm=4.25,
-        dots=Markers(pitch=1.85, radius=0.36, share=0.5, ink=(0.10, 0.15, 0.14)),
+        dots=Markers(pitch=1.85, radius=0.36, fraction=0.5, ink=(0.10, 0.15, 0.14)),
         contact_threshold=6.5,
     ),
     SensorRecord(
@@ -105,7 +105,7 @@ _WITH_TOKENS = (
         proportions=0.75,
         modulus_kpa=350.0,
         thickness_mm=3.0,
-        dots=Markers(pitch=2.2, radius=0.3, share=0.3),
+        dots=Markers(pitch=2.2, radius=0.3, fraction=0.3),
     ),
     SensorRecord(
         "9dtact",

@@ -14,7 +14,7 @@ def shorten(text: str) -> str:
     return f"{text[:350]} ... {text[-140:]}"
 
 
-def letters_apart(one: str, other: str) -> int:
+def edit_distance(one: str, other: str) -> int:
     """Return the edit distance of two words, with exchanged neighbours as one edit.
 
     It is the number of letters that must be added, removed, replaced or exchanged with the next

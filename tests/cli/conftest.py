@@ -7,7 +7,7 @@ from typing import NamedTuple
 import cv2
 import pytest
 from checked_world import columns
-from gel_pictures import press
+from gel_images import press
 
 from anytouch_jax.cli.app import main
 from anytouch_jax.data.manifest import manifest as manifests

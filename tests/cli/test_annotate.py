@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from chat_server import GOOD, KEY, serve
 from checked_world import columns
-from gel_pictures import press
+from gel_images import press
 
 from anytouch_jax.data.manifest import manifest as manifests
 
@@ -19,7 +19,7 @@ def _environment(monkeypatch):
 
 @pytest.fixture
 def touches(tmp_path):
-    """Three touches of two frames, with photographs, without captions."""
+    """Three touches of two frames, with RGB images, without captions."""
     rng = np.random.default_rng(0)
     for i in range(6):
         cv2.imwrite(str(tmp_path / f"{i}.png"), press(10 * i))

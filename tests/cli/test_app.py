@@ -296,12 +296,12 @@ def test_mistakes(mistake, tmp_path):
     assert "--camera-fps has no effect" in mistake("view", tmp_path, "--camera-fps", 30)
     assert "no.csv" in mistake("view", tmp_path / "no.csv")
     (tmp_path / "a.mp4").write_bytes(b"no film")
-    assert "no film" in mistake("view", tmp_path / "a.mp4")
+    assert "no video" in mistake("view", tmp_path / "a.mp4")
     assert "--head" in mistake("view", tmp_path, "--head", "h.npz")
     assert "One camera" in mistake("view", "0", "1")
     np.savez(tmp_path / "a.npz", x=np.zeros(3))
     assert "features" in mistake("view", tmp_path / "a.npz")
-    assert "no pictures" in mistake("view", tmp_path)
+    assert "no images" in mistake("view", tmp_path)
 
 
 def test_it_serves_what_it_is_given(anytouch, pressed, monkeypatch):
@@ -331,7 +331,7 @@ assert main(["--help"]) == 0
 ours = [name for name in sys.modules if name.startswith("anytouch_jax.")]
 known = ("anytouch_jax.cli", "anytouch_jax.config", "anytouch_jax.doors", "anytouch_jax.errors",
          "anytouch_jax.sensors", "anytouch_jax.signals", "anytouch_jax.text",
-         "anytouch_jax.shown")
+         "anytouch_jax.shown", "anytouch_jax.renamed")
 assert not [name for name in ours if not name.startswith(known)], ours
 assert not [name for name in ours if name.startswith("anytouch_jax.cli.")
             and name.rpartition(".")[2] not in ("app", "arguments")], ours

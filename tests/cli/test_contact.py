@@ -29,7 +29,7 @@ def test_frames_are_marked_next_to_the_manifest_or_dropped(anytouch, pressed, tm
     assert contacts(tmp_path / "kept.csv") == [0, 0, None, 1, 1, 1, 1]
 
 
-def test_a_threshold_moves_the_border_in_marks_check_and_picture(anytouch, pressed, tmp_path):
+def test_a_threshold_moves_the_border_in_marks_check_and_image(anytouch, pressed, tmp_path):
     done = anytouch("data", "contact", pressed, "--check")
     assert done.status == 0 and "precision 1.000, recall 1.000" in done.out
     # nothing without --out
@@ -45,7 +45,7 @@ def test_a_threshold_moves_the_border_in_marks_check_and_picture(anytouch, press
         "digit",
         (deep[7] + deep[8]) / 2,
         "--check",
-        "--picture",
+        "--image",
         tmp_path / "p.png",
     ]
     done = anytouch("data", "contact", pressed, *words)
@@ -97,7 +97,7 @@ def test_marks_that_are_known_are_kept_reported_and_cannot_be_moved(
     assert "line 6 of" in named and "'yes'" in named
     scores = "anytouch_jax.data.background.contact.contact_scores"
     monkeypatch.setattr(scores, lambda *_, **__: pytest.fail("scored in vain"))
-    assert "--share" in mistake("data", "contact", tmp_path / "m.parquet", "--share", 0.6)
+    assert "--fraction" in mistake("data", "contact", tmp_path / "m.parquet", "--fraction", 0.6)
 
 
 def test_backgrounds_are_named_on_the_command_line(anytouch, pressed, tmp_path):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from blank_recorder import BlankRecorder
 from checked_world import edit
-from gel_pictures import press
+from gel_images import press
 from reader_world import fill
 
 from anytouch_jax.cli.data import DatasetOptions
@@ -178,7 +178,7 @@ def test_frames_that_did_not_converge_are_counted(anytouch, tmp_path, monkeypatc
 
 @pytest.fixture
 def distinct(pressed):
-    """`pressed` with no two pictures alike."""
+    """`pressed` with no two images alike."""
     rng = np.random.default_rng(0)
     for i in range(10):
         noise = rng.integers(0, 4, (48, 48, 3), np.uint8)
@@ -221,7 +221,7 @@ def test_what_no_repair_can_decide_and_both_sides_of_a_split_are_errors(
 ):
     other = edit(tmp_path / "other.parquet", distinct, split=["test"] * 10)
     done = anytouch("data", "verify", distinct, other)
-    # the same pictures in train and test
+    # the same images in train and test
     assert done.status == 1 and "leak_file" in done.out
     splits = ["background"] * 2 + ["train"] * 4 + ["test"] * 4
     edit(distinct, object=["mug"] * 10, split=splits, sequence=[f"{name} 1" for name in splits])

@@ -5,8 +5,8 @@ import zlib
 import cv2
 import numpy as np
 import pytest
-from films import write_film
 from runs import run_config, train
+from videos import write_video
 
 import anytouch_jax as at
 from anytouch_jax.cli.arguments import DEFAULT
@@ -56,9 +56,9 @@ def test_a_manifest_and_a_folder_of_its_frames_have_the_same_features(embed, tmp
         of_folder["key/path"].tolist() == ["c2.png", "c3.png"]
         and str(of_folder["about/sensor"]) == "digit"
     )
-    of_picture = embed(folder / "c3.png", "--sensor", "digit")
+    of_image = embed(folder / "c3.png", "--sensor", "digit")
     np.testing.assert_allclose(
-        of_picture["features"], of_folder["features"][1:], rtol=1e-5, atol=1e-6
+        of_image["features"], of_folder["features"][1:], rtol=1e-5, atol=1e-6
     )
     other = embed(folder, "--sensor", "new_sensor")
     assert "'new_sensor'" in other["done"].err and "universal" in other["done"].err
@@ -79,7 +79,7 @@ def test_clips_of_a_manifest_and_of_a_video(embed, tmp_path, world):
         and "16 of 24" in of_manifest["done"].err
     )
     np.testing.assert_allclose(of_manifest["features"][:4], of_manifest["features"][4:], atol=1e-6)
-    video = write_film(
+    video = write_video(
         tmp_path / "touch.avi", [np.full((32, 32, 3), 40 * frame, np.uint8) for frame in range(5)]
     )
     # a large batch costs nothing
@@ -110,7 +110,7 @@ def test_a_stack_is_embedded_frame_by_frame(embed, tmp_path, mistake, tiny_run):
     assert "left" in mistake("embed", "--model", tiny_run, "--data", tmp_path / "two.npz", *out)
 
 
-def test_a_bad_picture_of_a_folder_is_named_or_left_out(embed, mistake, tmp_path, world, tiny_run):
+def test_a_bad_image_of_a_folder_is_named_or_left_out(embed, mistake, tmp_path, world, tiny_run):
     folder = tmp_path / "frames"
     folder.mkdir()
     for place, name in enumerate(("a0", "a1", "a2", "a3", "b0", "b1", "b2")):
@@ -171,7 +171,7 @@ def test_no_clip_spans_two_fingers_or_a_missing_number(embed, tmp_path, world):
 
 def test_a_folder_names_what_it_lacks(embed, tmp_path, world, tiny_run, mistake):
     """A missing sensor is noted once, a misspelled one refused, and so is a folder without
-    pictures.
+    images.
     """
     assert embed(world.parent)["done"].err.count("--sensor") == 1
     assert "--sensor" not in embed(world.parent, "--sensor", "universal")["done"].err
@@ -206,7 +206,7 @@ def test_a_folder_names_what_it_lacks(embed, tmp_path, world, tiny_run, mistake)
             ["frames", "--sensor", "digit", "--batch", "8", "--rotate", "270", "--flip", "down"],
             ["nowhere"],
         ),
-        (["film.mp4", "--on-bad-sample", "skip"], ["--on-bad-sample"]),
+        (["video.mp4", "--on-bad-sample", "skip"], ["--on-bad-sample"]),
         (["gone"], ["gone"]),
     ],
 )
@@ -215,7 +215,7 @@ def test_mistakes_are_named_before_the_encoder_is_loaded(
 ):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "frames").mkdir()
-    for name in ("m.csv", "film.mp4", "afile"):
+    for name in ("m.csv", "video.mp4", "afile"):
         (tmp_path / name).write_text("")
     out = [] if "--out" in words else ["--out", "f.npz"]
     sentence = mistake("embed", "--model", "nowhere", "--data", *words, *out)
@@ -231,9 +231,9 @@ def test_a_misspelt_sensor_is_named_before_the_encoder_is_loaded(
         raise AssertionError("loading takes seconds")
 
     monkeypatch.setattr(load, "load_model", loaded)
-    film = write_film(tmp_path / "film.avi", [np.zeros((32, 32, 3), np.uint8)])
+    video = write_video(tmp_path / "video.avi", [np.zeros((32, 32, 3), np.uint8)])
     model = ["--model", tiny_run] if stored == "run" else []
-    words = (command, *model, "--data", film, "--out", tmp_path / "f.npz", "--sensor")
+    words = (command, *model, "--data", video, "--out", tmp_path / "f.npz", "--sensor")
     assert "did you mean digit" in mistake(*words, "DIGIT")
     assert "sensor.json" in mistake(*words, "gone.sensor")
 
@@ -289,7 +289,7 @@ def test_the_head_of_a_probe_names_the_rows_of_a_manifest(embed, anytouch, world
 
 
 def test_a_stream_names_each_frame(anytouch, mistake, tmp_path, tiny_run, head):
-    video = write_film(
+    video = write_video(
         tmp_path / "touch.avi", [np.full((32, 32, 3), value, np.uint8) for value in (40, 180)]
     )
     # whose pooling is taken
@@ -300,7 +300,7 @@ def test_a_stream_names_each_frame(anytouch, mistake, tmp_path, tiny_run, head):
     np.testing.assert_allclose([line["p"] for line in lines], p.max(1), atol=1e-6)
     assert {tuple(line["set"]) for line in lines} <= {(), ("ball",), ("cube",), ("ball", "cube")}
     assert {line["novel"] for line in lines} <= {True, False}
-    # no picture of the untouched gel
+    # no image of the untouched gel
     assert [line["contact"] for line in lines] == [None, None]
     gel = np.full((32, 32, 3), 40, np.uint8)
     gel[8:24, 8:24] = 200  # of which neither frame is a tint

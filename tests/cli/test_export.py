@@ -5,8 +5,8 @@ import cv2
 import jax
 import numpy as np
 import pytest
-from films import write_film
 from tiny_models import touch_model
+from videos import write_video
 
 from anytouch_jax.config import SENSORS, to_json
 from anytouch_jax.encoder.encoder import load_encoder
@@ -93,18 +93,18 @@ def test_a_file_for_engines_embeds_and_streams_like_the_run(anytouch, tmp_path, 
         assert (
             np.abs(found - live).max() < tolerance * np.abs(live).max() and weights == fingerprint
         )
-    film = write_film(
-        tmp_path / "film.avi", [cv2.imread(str(tmp_path / f"{number}.png")) for number in range(3)]
+    video = write_video(
+        tmp_path / "video.avi", [cv2.imread(str(tmp_path / f"{number}.png")) for number in range(3)]
     )
     engines = (
         ["--model", tiny_run],
         ["--model", tiny_run, "--engine", "onnxruntime"],
         ["--model", out],
     )
-    found = [features("stream", film, *words, "--sensor", "digit")[0] for words in engines]
+    found = [features("stream", video, *words, "--sensor", "digit")[0] for words in engines]
     np.testing.assert_allclose(found[1:], [found[0]] * 2, atol=1e-5)
     done = anytouch(
-        "stream", "--model", out, "--engine", "xla", "--data", film, "--out", tmp_path / "no.npz"
+        "stream", "--model", out, "--engine", "xla", "--data", video, "--out", tmp_path / "no.npz"
     )
     assert done.status == 2 and "not on xla" in done.err and not (tmp_path / "no.npz").exists()
 
@@ -154,14 +154,20 @@ def two(tmp_path):
 def test_weights_between_two_runs_are_interpolated(two, tmp_path, weights):
     (first, second), params = two
     start, end = (flatten(tree) for tree in params)
-    for share in (0, 0.25, 1):
+    for fraction in (0, 0.25, 1):
         out = weights(
-            "safetensors", second, tmp_path / "w.safetensors", "--between", first, "--share", share
+            "safetensors",
+            second,
+            tmp_path / "w.safetensors",
+            "--between",
+            first,
+            "--fraction",
+            fraction,
         )
         arrays = load.read_weights(out)
         assert arrays.keys() == end.keys()
         for name, array in arrays.items():
-            expected = np.asarray(start[name]) * (1 - share) + np.asarray(end[name]) * share
+            expected = np.asarray(start[name]) * (1 - fraction) + np.asarray(end[name]) * fraction
             np.testing.assert_allclose(array, expected, rtol=1e-6, atol=1e-7)
     clip = np.random.default_rng(0).integers(0, 256, (2, 3, 28, 28, 3), np.uint8)
     np.testing.assert_array_equal(
@@ -176,8 +182,8 @@ def test_weights_between_two_runs_are_interpolated(two, tmp_path, weights):
     [
         ("--out m.bin --frames 2", "3 frames"),
         ("--out m.bin --model gone", "gone"),
-        ("--out m.bin --join sum", "--join"),
-        ("--out m.bin --share 0.3", "--share"),
+        ("--out m.bin --aggregation sum", "--aggregation"),
+        ("--out m.bin --fraction 0.3", "--fraction"),
         ("--out afile/m.bin", "--out"),
         ("--out m.onnx --int8", "--int8 has no effect with --to jax"),
         ("--out m.onnx --to onnx --data few.csv", "--int8 and --data"),
@@ -188,7 +194,7 @@ def test_weights_between_two_runs_are_interpolated(two, tmp_path, weights):
         ("--out w.safetensors --to release", "--to safetensors"),  # it lacks a decoder
         ("--out b.safetensors --to safetensors", "--out"),
         ("--out w.safetensors --to safetensors --frames 3", "--frames"),
-        ("--out w.safetensors --to safetensors --share 0.25", "--share"),
+        ("--out w.safetensors --to safetensors --fraction 0.25", "--fraction"),
         ("--out w.safetensors --to safetensors --between eps.safetensors", "norm_eps"),
         ("--out w.safetensors --to safetensors --between gel.safetensors", "background"),
     ],

@@ -4,10 +4,10 @@ import shutil
 import cv2
 import numpy as np
 import pytest
-from films import write_film
 from places import ROOT
 from safetensors.numpy import save_file
 from touch_world import make_touches
+from videos import write_video
 
 from anytouch_jax import load_encoder
 from anytouch_jax.export import export
@@ -98,12 +98,12 @@ def test_probes_retrieval_and_regression_of_a_family(anytouch, family, files, to
 
 
 @pytest.mark.parametrize("family", FAMILIES)
-def test_a_streamed_film_gives_the_features_of_embed(anytouch, family, files, tmp_path):
-    film = tmp_path / "film.avi"
+def test_a_streamed_video_gives_the_features_of_embed(anytouch, family, files, tmp_path):
+    video = tmp_path / "video.avi"
     gel = tmp_path / "gel.png"
-    write_film(film, (np.full((40, 48, 3), 25 * frame, np.uint8) for frame in range(9)))
+    write_video(video, (np.full((40, 48, 3), 25 * frame, np.uint8) for frame in range(9)))
     cv2.imwrite(str(gel), np.full((40, 48, 3), 90, np.uint8))
-    words = ["--model", files[family], "--data", film, "--sensor", "digit", "--background", gel]
+    words = ["--model", files[family], "--data", video, "--sensor", "digit", "--background", gel]
     words += ["--frames", load_encoder(files[family]).form.model.frames]
     outs = [tmp_path / f"{name}.npz" for name in ("stream", "embed")]
     for name, out in zip(("stream", "embed"), outs, strict=True):
@@ -150,7 +150,7 @@ def test_a_run_starts_from_a_family_whose_form_and_export_are_known(
         "--stop-after",
         1,
     ]
-    words += [*size.split(), "--model.decoder.heads", "2", "--data.clip-share", "0"]
+    words += [*size.split(), "--model.decoder.heads", "2", "--data.clip-fraction", "0"]
     done = anytouch("train", "--data", touches, *words)
     assert done.status == 2 and "--model.no-pre-norm" in done.err, done.err
     done = anytouch("train", "--data", touches, *words, "--model.no-pre-norm")

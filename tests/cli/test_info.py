@@ -151,12 +151,12 @@ def test_an_adapted_run_and_an_export(anytouch, tiny_run, world, tmp_path):
     assert "is damaged" in anytouch("info", tmp_path / "encoder.bin").err
 
 
-def test_the_health_of_each_unit_is_a_table_a_picture_and_a_status(
+def test_the_health_of_each_unit_is_a_table_a_image_and_a_status(
     anytouch, mistake, tmp_path, world, tiny_run
 ):
-    done = anytouch("info", world, "--health", "--picture", tmp_path / "h.png", "--model", tiny_run)
+    done = anytouch("info", world, "--health", "--image", tmp_path / "h.png", "--model", tiny_run)
     assert done.status in (0, 1) and "digit" in done.out and "orientation and colours" in done.out
     assert "contact visible to the encoder" in done.out and "units are good" in done.out
     assert (done.status == 1) == ("FAULT" in done.out)
     assert (tmp_path / "h.png").read_bytes()[:4] == b"\x89PNG"
-    assert "--health" in mistake("info", world, "--picture", tmp_path / "h.png")
+    assert "--health" in mistake("info", world, "--image", tmp_path / "h.png")

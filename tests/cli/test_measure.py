@@ -6,12 +6,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from films import write_film
 from measuring import gel, measuring_weights
+from videos import write_video
 
 from anytouch_jax.cli.app import main
 from anytouch_jax.encoder.base import Encoder
-from anytouch_jax.fields.film import Film
+from anytouch_jax.fields.video import Video
 
 
 @pytest.fixture(scope="module")
@@ -21,23 +21,23 @@ def weights(tmp_path_factory):
 
 @pytest.fixture
 def frames(tmp_path):
-    """A folder of five pictures of a DIGIT and of its untouched gel, and the same as a film and as
+    """A folder of five images of a DIGIT and of its untouched gel, and the same as a video and as
     a manifest.
     """
     folder = tmp_path / "frames"
     folder.mkdir()
-    pictures = []
+    images = []
     lines = ["path,sensor,sequence,frame_index,split,background_path"]
     for number in range(5):
-        picture = gel(64, 48)
-        picture[10:30, 10 : 20 + 5 * number] += 60
-        cv2.imwrite(str(folder / f"{number}.png"), picture[..., ::-1])
-        pictures.append(picture[..., ::-1])
+        image = gel(64, 48)
+        image[10:30, 10 : 20 + 5 * number] += 60
+        cv2.imwrite(str(folder / f"{number}.png"), image[..., ::-1])
+        images.append(image[..., ::-1])
         lines.append(f"frames/{number}.png,digit,press,{number},train,frames/background.png")
     cv2.imwrite(str(folder / "background.png"), gel(64, 48)[..., ::-1])
-    write_film(tmp_path / "film.avi", pictures, 30)
-    np.save(tmp_path / "stack.npy", np.stack(pictures)[..., ::-1])
-    np.savez(tmp_path / "stack.npz", frames=np.stack(pictures)[..., ::-1], force=np.zeros(5))
+    write_video(tmp_path / "video.avi", images, 30)
+    np.save(tmp_path / "stack.npy", np.stack(images)[..., ::-1])
+    np.savez(tmp_path / "stack.npz", frames=np.stack(images)[..., ::-1], force=np.zeros(5))
     lines.append("frames/background.png,gelsight_mini,other,0,train,")
     (tmp_path / "manifest.csv").write_text("\n".join(lines) + "\n")
     return tmp_path
@@ -45,8 +45,8 @@ def frames(tmp_path):
 
 def test_every_form_of_data_gives_maps_and_a_line_a_frame(frames, weights, capsys, monkeypatch):
     monkeypatch.chdir(frames)
-    more = ("--film", "shown.avi", "--ply", "gel.ply")
-    every = ("frames", "film.avi", "stack.npy", "stack.npz", "frames/4.png", "manifest.csv")
+    more = ("--video", "shown.avi", "--ply", "gel.ply")
+    every = ("frames", "video.avi", "stack.npy", "stack.npz", "frames/4.png", "manifest.csv")
     for data, count in zip(every, (5, 5, 5, 5, 1, 6), strict=True):
         sensor = () if data == "manifest.csv" else ("--sensor", "digit")
         assert (
@@ -79,7 +79,7 @@ def test_every_form_of_data_gives_maps_and_a_line_a_frame(frames, weights, capsy
     ("more", "word"),
     [
         (("--out", "out.csv"), ".npz"),
-        (("--out", "frames.npz", "--film", "x.gif"), ".mp4"),
+        (("--out", "frames.npz", "--video", "x.gif"), ".mp4"),
         (("--out", "manifest.npz", "--data", "manifest.csv"), "is a file that is read"),
         (("--out", "out.npz", "--width-mm", "0"), "above 0"),
         (("--out", "out.npz", "--data", "nothing"), "is no"),
@@ -120,34 +120,34 @@ def test_a_fault_is_reported_once(frames, weights, capsys, monkeypatch):
         )
         == 0
     )
-    assert capsys.readouterr().err.count("the picture is grey") == 1
+    assert capsys.readouterr().err.count("the image is grey") == 1
 
 
 def words(weights, *more: str) -> list[str]:
     return ["measure", "--model", weights, "--sensor", "digit", *more]
 
 
-def test_a_film_has_the_rate_of_its_recording(frames, weights, monkeypatch):
+def test_a_video_has_the_rate_of_its_recording(frames, weights, monkeypatch):
     monkeypatch.chdir(frames)
-    pictures = [cv2.imread(f"frames/{number}.png") for number in range(5)]
-    write_film("slow.avi", pictures, 12)
+    images = [cv2.imread(f"frames/{number}.png") for number in range(5)]
+    write_video("slow.avi", images, 12)
     lines = Path("manifest.csv").read_text().splitlines()
     stamps = ["timestamp", *(f"{0.05 * number}" for number in range(5)), "0"]
     Path("timed.csv").write_text("\n".join(map(",".join, zip(lines, stamps, strict=True))))
     for data, rate in (("slow.avi", 12), ("frames", 30), ("manifest.csv", 30), ("timed.csv", 20)):
         sensor = [] if data.endswith(".csv") else ["--sensor", "digit"]
-        more = ["--data", data, "--out", "out.npz", "--film", "shown.avi"]
+        more = ["--data", data, "--out", "out.npz", "--video", "shown.avi"]
         assert main(["measure", "--model", weights, *sensor, *more]) == 0
         assert cv2.VideoCapture("shown.avi").get(cv2.CAP_PROP_FPS) == pytest.approx(rate, rel=1e-3)
 
 
-def test_a_film_that_cannot_be_written_is_an_error_and_costs_no_numbers(
+def test_a_video_that_cannot_be_written_is_an_error_and_costs_no_numbers(
     frames, weights, capsys, monkeypatch
 ):
     monkeypatch.chdir(frames)
-    monkeypatch.setattr(Film, "_is_whole", lambda self: False)
+    monkeypatch.setattr(Video, "_is_whole", lambda self: False)
     Path("shown.avi").write_bytes(b"an earlier film")
-    more = ("--data", "frames", "--out", "out.npz", "--film", "shown.avi")
+    more = ("--data", "frames", "--out", "out.npz", "--video", "shown.avi")
     assert main(words(weights, *more)) == 2
     assert "shown.avi" in capsys.readouterr().err
     assert Path("shown.avi").read_bytes() == b"an earlier film"
@@ -169,7 +169,7 @@ def test_ctrl_c_keeps_what_was_measured_and_replaces_nothing(frames, weights, ca
         return real(self, *given, **more)
 
     monkeypatch.setattr(Encoder, "measure", interrupted)
-    more = ("--data", "frames", "--out", "out.npz", "--film", "shown.avi", "--ply", "gel.ply")
+    more = ("--data", "frames", "--out", "out.npz", "--video", "shown.avi", "--ply", "gel.ply")
     names = ("out.npz", "out.csv", "shown.avi", "gel.ply")
     assert main(words(weights, *more)) == 130
     assert "out.npz and out.csv: 32 frames" in capsys.readouterr().out
@@ -184,8 +184,8 @@ def test_ctrl_c_keeps_what_was_measured_and_replaces_nothing(frames, weights, ca
         with np.load(f"out{end}.npz") as arrays:
             assert arrays["depth"].shape[0] == len(arrays["name"]) == 32
         assert len(Path(f"out{end}.csv").read_text().splitlines()) == 33
-        film = cv2.VideoCapture(f"shown{end}.avi")
-        assert sum(film.grab() for _ in range(40)) == 32
+        video = cv2.VideoCapture(f"shown{end}.avi")
+        assert sum(video.grab() for _ in range(40)) == 32
         assert Path(f"gel{end}.ply").read_bytes().startswith(b"ply")
     assert not [file for file in frames.iterdir() if file.name.startswith(".")]
     capsys.readouterr()

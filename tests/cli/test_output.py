@@ -75,10 +75,10 @@ def test_the_folder_of_an_output_is_made_where_it_can_be(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("typed", "named"),
     [
-        ("data contact touch.parquet --picture c.parquet --out c.parquet", ["--out", "--picture"]),
-        ("data contact touch.parquet --picture c.jpg", ["--picture", ".png"]),
-        ("data contact touch.parquet --picture afile/c.png", ["afile", "--picture"]),
-        ("data contact touch.parquet --picture 5.png", ["5.png", "--picture"]),
+        ("data contact touch.parquet --image c.parquet --out c.parquet", ["--out", "--image"]),
+        ("data contact touch.parquet --image c.jpg", ["--image", ".png"]),
+        ("data contact touch.parquet --image afile/c.png", ["afile", "--image"]),
+        ("data contact touch.parquet --image 5.png", ["5.png", "--image"]),
         ("data verify touch.parquet --repair r.csv --out r.csv", ["--repair", "--out"]),
         (
             "data verify touch.parquet --commercial-only r.csv --out r.csv",

@@ -19,14 +19,14 @@ def test_a_label_is_reported_on_test_and_written_as_json(
     ("typed", "named"),
     [
         ("label --leave-out object --group unit --seeds 3", ["--group", "--seeds"]),
-        ("label --leave-out object --protocol published", ["--protocol"]),
+        ("label --leave-out object --protocol released", ["--protocol"]),
         ("label --train-sensor a --test-sensor b --seeds 3", ["--seeds", "--train-sensor"]),
         ("label --save h.npz --model a b", ["--save", "--model"]),
         ("label --save h.json --model a", ["--save", ".npz"]),
         ("label --model a --save h.npz --out h.npz", ["--save", "--out"]),
         ("label --out nowhere.csv/deep/p.json", ["nowhere.csv"]),
         ("tasks --cache afile", ["--cache", "afile"]),
-        ("tasks --tasks slip --join concat", ["--join"]),
+        ("tasks --tasks slip --aggregation concat", ["--aggregation"]),
         ("tasks --frames 1 --order repeated", ["--order"]),
     ],
 )
@@ -41,11 +41,11 @@ def test_options_that_do_not_go_together_are_named(mistake, tmp_path, monkeypatc
 @pytest.mark.parametrize(
     "typed",
     [
-        "label --label slip --frames 3 --pooling mean --protocol published --seeds 2",
+        "label --label slip --frames 3 --pooling mean --protocol released --seeds 2",
         "label --leave-out object --where force 1 --sensor digit",
         "label --leave-out sequence --model a --save h.npz --coverage 0.8",
-        "tasks --tasks all --order shuffled --cache c --join sum --frames 6 --max-rows 9 --heads "
-        "linear knn",
+        "tasks --tasks all --order shuffled --cache c --aggregation sum --frames 6 --max-rows 9 "
+        "--heads linear knn",
         "tasks --tasks slip force --train-sensors digit gelslim --test-units cam0_* b",
         "benchmark --benchmark feel_grasp --train-sensors digit --seeds 2 --cache c",
     ],

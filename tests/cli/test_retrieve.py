@@ -46,14 +46,14 @@ def test_retrieval_of_a_run_and_its_controls(touches, tiny_run, tmp_path, capsys
         assert one["low"] <= one["top1"] <= one["high"] <= one["top5_high"]
     # every touch has its own texture
     assert pooled["pixels minus background"]["top1"] > 0.4
-    shares = []
+    fractions = []
     for more in ([], ["--by-chance"]):
         assert main(["retrieve", "--data", str(touches), "--gallery", "6", *more]) == 0
         line = next(
             x for x in capsys.readouterr().out.splitlines() if "force | all | all | no" in x
         )
-        shares.append(float(line.split("|")[5].split()[0]))
-    assert shares[1] > shares[0]
+        fractions.append(float(line.split("|")[5].split()[0]))
+    assert fractions[1] > fractions[0]
 
 
 def test_a_mistake_is_one_sentence(touches, mistake, tmp_path, world, monkeypatch):
@@ -106,7 +106,7 @@ def test_stored_touches_are_searched_by_a_frame(
     assert "did you mean digit" in mistake(*words, world.parent / path, "--sensor", "DIGIT")
 
 
-def test_a_picture_of_the_index_is_no_other_sensor(tmp_path, capfd):
+def test_a_image_of_the_index_is_no_other_sensor(tmp_path, capfd):
     """Two of the package's examples differ by 13 grey levels or more from their own gels."""
     encoder = SimpleNamespace(subtracts=True, needs_background=True)
     touches = at.example_touches()
@@ -117,5 +117,5 @@ def test_a_picture_of_the_index_is_no_other_sensor(tmp_path, capfd):
         gel, what = choose_gel(encoder, None, path, known, "the index was made with")
         said = capfd.readouterr().err
         assert gel is not None and any(gel is one for one in known.values())
-        assert said == f"untouched gel: {what}\n" and "picture that the index was made with" in what
+        assert said == f"untouched gel: {what}\n" and "image that the index was made with" in what
         assert "head" not in said and "trust" not in said

@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 from faulty_camera import FaultyCamera, write_uneven_video
-from films import write_film
 from measuring import measuring_weights
+from videos import write_video
 
 from anytouch_jax.live import stream as streams
 
@@ -16,7 +16,7 @@ from anytouch_jax.live import stream as streams
 @pytest.fixture(scope="module")
 def video(tmp_path_factory):
     path = tmp_path_factory.mktemp("video") / "touch.avi"
-    write_film(path, (np.full((32, 32, 3), 40 * frame, np.uint8) for frame in range(6)))
+    write_video(path, (np.full((32, 32, 3), 40 * frame, np.uint8) for frame in range(6)))
     return path
 
 
@@ -32,7 +32,7 @@ def test_a_streamed_video_gives_the_features_of_embed(anytouch, tmp_path, video,
     with np.load(streamed) as a, np.load(plain) as b:
         np.testing.assert_allclose(a["features"], b["features"], atol=1e-5)
         assert a["key/frame_index"].tolist() == b["key/frame_index"].tolist() == [2, 3, 4, 5]
-        # in the film of ten frames a second
+        # in the video of ten frames a second
         np.testing.assert_allclose(a["key/time"], [0.2, 0.3, 0.4, 0.5])
         assert (
             str(a["about/stride"]) == "1" and "about/started" not in a and not a["key/reused"].any()
@@ -121,7 +121,7 @@ def test_ctrl_c_saves_what_there_is(anytouch, tmp_path, tiny_run, monkeypatch):
         assert file["features"].ndim == 2 and len(file["features"]) <= 1
 
 
-def test_a_picture_on_its_side_is_turned(anytouch, tmp_path, tiny_run):
+def test_a_image_on_its_side_is_turned(anytouch, tmp_path, tiny_run):
     """A folder, and a video frame by frame: as if the camera had been held upright."""
     rng = np.random.default_rng(0)
     upright = [cv2.resize(rng.integers(0, 256, (4, 3, 3), np.uint8), (24, 32)) for _ in range(3)]
@@ -131,7 +131,7 @@ def test_a_picture_on_its_side_is_turned(anytouch, tmp_path, tiny_run):
         (tmp_path / name).mkdir()
         for number, frame in enumerate(frames):
             cv2.imwrite(str(tmp_path / name / f"{number}.png"), frame)
-        write_film(tmp_path / f"{name}.avi", frames, code="FFV1")
+        write_video(tmp_path / f"{name}.avi", frames, code="FFV1")
         turn = ("--rotate", 90, "--flip", "across") if name == "lying" else ()
         for form, command in ((name, "embed"), (f"{name}.avi", "stream")):
             out = tmp_path / "f.npz"

@@ -33,7 +33,7 @@ def options_of(sizes: dict[str, object]) -> list[str]:
 SMALL = options_of(SIZES)
 # The sizes of `tiny_run`.
 TINY_RUN = options_of(
-    {name: value for name, value in SIZES.items() if "clip-share" not in name}
+    {name: value for name, value in SIZES.items() if "clip-fraction" not in name}
     | {"model.touch.depth": 2}
 )
 
@@ -106,7 +106,7 @@ def test_a_missing_manifest_is_one_sentence(mistake, tmp_path):
     assert not (tmp_path / "new").exists()
 
 
-def test_a_corrupt_picture_is_named_and_may_be_skipped_and_counted(
+def test_a_corrupt_image_is_named_and_may_be_skipped_and_counted(
     anytouch, mistake, tmp_path, world
 ):
     manifest = shutil.copytree(world.parent, tmp_path / "world") / world.name
@@ -324,11 +324,11 @@ sys.exit(run(TrainRequest(options, config_of(Path({world!r}), {stage}, **{more!r
 
 
 def config_of(world: Path, stage: int, *, steps: int = 20, **run):
-    """Stage 1, or stage 2 with photographs and captions for some; a rate at which rounding stays
+    """Stage 1, or stage 2 with RGB images and captions for some; a rate at which rounding stays
     rounding.
     """
     config = run_config(world, stage, steps=steps, **({"save_every": 5} | run))
-    data = replace(config.data, clip_share=1.0) if stage == 2 else config.data
+    data = replace(config.data, clip_fraction=1.0) if stage == 2 else config.data
     return replace(config, data=data, optim=replace(config.optim, learning_rate=1e-4))
 
 
@@ -351,7 +351,7 @@ def agree(run: Path, other: Path) -> None:
     assert [[row["step"] for row in lines] for lines in rows] == [list(range(20))] * 2
     for a, b in zip(*rows, strict=True):
         assert a.keys() == b.keys()
-        for name in a.keys() - {"wait", "wait_share", "match_accuracy", "update_norm"}:
+        for name in a.keys() - {"wait", "wait_fraction", "match_accuracy", "update_norm"}:
             close = (
                 1e-5 if name in ("loss", "align", "match", "reconstruction", "next_frame") else 1e-4
             )
@@ -368,7 +368,7 @@ def lone(request, tmp_path_factory, world):
 @pytest.mark.slow
 def test_one_two_and_four_devices_and_two_processes_give_the_same_losses(lone, world, tmp_path):
     stage, run, _ = lone
-    if stage == 2:  # InfoNCE over the global batch: some rows have no photograph or caption
+    if stage == 2:  # InfoNCE over the global batch: some rows have no RGB image or caption
         assert 0 < read_metrics(run)[0]["touch_text_pairs"] < 8
     for devices, fsdp in ((2, 1), (4, 2)):
         train(

@@ -53,11 +53,19 @@ TRAIN = ["--data", "m.csv", "--run", "r"]
 
 def test_train_takes_a_baseline_before_the_users_own_overrides() -> None:
     _, config = train.parse(train.TrainOptions, "train", [*TRAIN, "--baseline", "t3"])
-    assert config.model.patch_encoder == "sensor" and config.data.clip_share == 0
-    args = [*TRAIN, "--baseline", "t3", "--model.sensor-tokens", "2", "--data.clip-share", "0.25"]
+    assert config.model.patch_encoder == "sensor" and config.data.clip_fraction == 0
+    args = [
+        *TRAIN,
+        "--baseline",
+        "t3",
+        "--model.sensor-tokens",
+        "2",
+        "--data.clip-fraction",
+        "0.25",
+    ]
     _, config = train.parse(train.TrainOptions, "train", args)
     assert config.model.patch_encoder == "sensor" and config.model.sensor_tokens == 2
-    assert config.data.clip_share == 0.25 and not config.objective.next_frame
+    assert config.data.clip_fraction == 0.25 and not config.objective.next_frame
     _, config = train.parse(
         train.TrainOptions, "train", [*TRAIN, "--stage", "2", "--data.require", "image", "text"]
     )

@@ -3,9 +3,9 @@ import sys
 import cv2
 import numpy as np
 import pytest
-from films import write_film
 from PIL import Image, ImageOps
 from refused import refused
+from videos import write_video
 
 from anytouch_jax.data import images
 from anytouch_jax.data.images import ImageError, decode, decode_bytes, encode
@@ -30,14 +30,12 @@ def _encoded(suffix, image=RGB):
 def test_every_format_gives_rgb(tmp_path, suffix):
     path = tmp_path / f"x{suffix}"
     is_lossy = suffix in (".jpg", ".webp")
-    picture = np.full((40, 60, 3), (200, 100, 50), np.uint8) if is_lossy else RGB
-    path.write_bytes(_encoded(suffix, picture))
+    image = np.full((40, 60, 3), (200, 100, 50), np.uint8) if is_lossy else RGB
+    path.write_bytes(_encoded(suffix, image))
     got = decode(path)
     assert got.dtype == np.uint8 and got.flags.c_contiguous
-    np.testing.assert_allclose(got, picture, atol=4 * is_lossy)
-    np.testing.assert_allclose(
-        decode_bytes(encode(picture, suffix), "p"), picture, atol=4 * is_lossy
-    )
+    np.testing.assert_allclose(got, image, atol=4 * is_lossy)
+    np.testing.assert_allclose(decode_bytes(encode(image, suffix), "p"), image, atol=4 * is_lossy)
     fine, coarse = (encode(RGB, ".jpg", cv2.IMWRITE_JPEG_QUALITY, quality) for quality in (90, 10))
     assert len(coarse) < len(fine)
 
@@ -69,18 +67,18 @@ def test_grey_alpha_sixteen_bits_and_floats(tmp_path):
 
 def test_a_jpeg_with_a_trailer_or_a_thumbnail_is_whole(tmp_path):
     whole = _encoded(".jpg")
-    # phones append films; markers stand in them by chance
+    # phones append videos; markers stand in them by chance
     for seed in range(5):
         path = tmp_path / f"{seed}.jpg"
         path.write_bytes(whole + np.random.default_rng(seed).bytes(200_000) + b"\xff\xda")
         np.testing.assert_array_equal(decode(path), decode_bytes(whole, "whole"))
-    # an EXIF segment with a picture in it
+    # an EXIF segment with an image in it
     thumbnail = b"\xff\xe1" + (len(whole) + 2).to_bytes(2) + whole
     path.write_bytes(whole[:2] + thumbnail + whole[2 : len(whole) * 2 // 3])
     refused("cut short", decode, path)
 
 
-def test_files_that_are_no_pictures_are_named(tmp_path):
+def test_files_that_are_no_images_are_named(tmp_path):
     page = b"\n<!DOCTYPE html>"
     pointer = b"version https://git-lfs.github.com/spec/v1\noid"
     corrupt = _encoded(".png")
@@ -110,7 +108,7 @@ def test_a_folder_comes_in_natural_order(tmp_path):
     for number in (10, 9, 1):
         image = np.full((4, 4, 3), number, np.uint8)
         cv2.imwrite(str(tmp_path / f"img{number}.png"), image)
-    (tmp_path / "notes.txt").write_text("no picture")
+    (tmp_path / "notes.txt").write_text("no image")
     assert [decode(file)[0, 0, 0] for file in images.list_images(tmp_path)[0]] == [1, 9, 10]
     for name in ("background.jpg", "Photo.png"):
         assert cv2.imwrite(str(tmp_path / name), np.zeros((4, 4, 3), np.uint8))
@@ -134,7 +132,7 @@ def test_a_folder_comes_in_natural_order(tmp_path):
     assert frame_order(["b.png", "img10.png", "3.png"]) == (["b.png", "img10.png", "3.png"], False)
     (tmp_path / "empty").mkdir()
     for folder, words in (
-        (tmp_path / "empty", "no pictures"),
+        (tmp_path / "empty", "no images"),
         (tmp_path / "none", "there is no folder"),
     ):
         refused(words, images.list_images, folder)
@@ -142,20 +140,20 @@ def test_a_folder_comes_in_natural_order(tmp_path):
 
 def test_a_video_gives_its_frames_in_rgb(tmp_path, monkeypatch):
     path = tmp_path / "v.avi"
-    write_film(path, (np.full((24, 32, 3), (0, 0, level), np.uint8) for level in (0, 100, 200)))
+    write_video(path, (np.full((24, 32, 3), (0, 0, level), np.uint8) for level in (0, 100, 200)))
     frames = list(images.frames_from_video(path))
     assert [frame.shape for frame in frames] == [(24, 32, 3)] * 3
     assert [round(float(frame[..., 0].mean()) / 100) for frame in frames] == [0, 1, 2]
     assert max(frame[..., 2].mean() for frame in frames) < 10
     monkeypatch.chdir(tmp_path)
-    write_film(tmp_path / "10:30.mp4", (np.zeros((24, 32, 3), np.uint8) for _ in range(3)))
+    write_video(tmp_path / "10:30.mp4", (np.zeros((24, 32, 3), np.uint8) for _ in range(3)))
     # no protocol
     assert len(list(images.frames_from_video("10:30.mp4"))) == images.count_frames("10:30.mp4") == 3
 
 
 @pytest.mark.parametrize("kind", ["jpg", "png", "webp", "tif"])
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_a_picture_is_turned_as_its_tag_says(tmp_path, kind, orientation):
+def test_a_image_is_turned_as_its_tag_says(tmp_path, kind, orientation):
     stored = Image.fromarray(
         np.add.outer(np.arange(40) * 2, np.arange(60)).astype(np.uint8)
     ).convert("RGB")
@@ -173,7 +171,7 @@ ODD = b"Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x63\0\0\0\0\0\0"
 
 
 @pytest.mark.parametrize("tags", [b"Exif\0\0", ODD])
-def test_an_odd_orientation_tag_leaves_the_picture(tmp_path, tags):
+def test_an_odd_orientation_tag_leaves_the_image(tmp_path, tags):
     whole = _encoded(".jpg")
     data = whole[:2] + b"\xff\xe1" + (len(tags) + 2).to_bytes(2) + tags + whole[2:]
     np.testing.assert_array_equal(decode_bytes(data, "x"), decode_bytes(whole, "x"))
@@ -182,10 +180,10 @@ def test_an_odd_orientation_tag_leaves_the_picture(tmp_path, tags):
 def test_a_video_is_turned_as_its_tag_says(tmp_path):
     path = tmp_path / "v.mp4"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 10, (64, 48))
-    picture = np.zeros((48, 64, 3), np.uint8)
-    picture[:24, :32] = 255  # white at the upper left
+    image = np.zeros((48, 64, 3), np.uint8)
+    image[:24, :32] = 255  # white at the upper left
     for _ in range(3):
-        writer.write(picture)
+        writer.write(image)
     writer.release()
     data = bytearray(path.read_bytes())
     at = data.index(b"tkhd") + 44  # its matrix: by 90 degrees clockwise
@@ -197,7 +195,7 @@ def test_a_video_is_turned_as_its_tag_says(tmp_path):
 
 
 @pytest.mark.parametrize("kind", [np.float64, np.int32, np.int16, np.int8])
-def test_a_tiff_of_an_unusual_type_is_a_picture_or_a_sentence(tmp_path, kind):
+def test_a_tiff_of_an_unusual_type_is_a_image_or_a_sentence(tmp_path, kind):
     path = tmp_path / "odd.tiff"
     values = np.zeros((6, 8, 3), kind)
     values[..., 0] = 1  # blue, as OpenCV writes it
@@ -217,7 +215,7 @@ def test_strips_and_tiffs_that_opencv_would_read_wrong_are_refused(tmp_path):
     clear.save(tmp_path / "clear.tif")
     Image.fromarray(np.zeros((1, 2000, 3), np.uint8)).save(tmp_path / "strip.tif")
     for name, sentence in (
-        ("several", "several pictures"),
+        ("several", "several images"),
         ("clear", "would be multiplied"),
         ("strip", "is a strip"),
     ):
@@ -307,7 +305,7 @@ def test_frames_come_in_the_order_of_the_numbers_in_their_names(names):
         (["a3f9.png", "b3c1.png", "3d3e.png", "c9f9.png", "7f3.png", "e1.png"], None),
     ],
 )
-def test_series_that_share_numbers_are_apart(names, series):
+def test_series_that_fraction_numbers_are_apart(names, series):
     if isinstance(series, tuple):  # the series of each name, in turn
         keys = [series[i % len(series)] for i in range(len(names))]
         series = {
@@ -317,7 +315,7 @@ def test_series_that_share_numbers_are_apart(names, series):
 
 
 @pytest.mark.parametrize("ending", ["mp4", "mkv"])
-def test_a_film_that_opencv_cannot_decode_is_read_or_its_codec_is_named(
+def test_a_video_that_opencv_cannot_decode_is_read_or_its_codec_is_named(
     tmp_path, monkeypatch, ending
 ):
     av = pytest.importorskip("av")
@@ -326,28 +324,26 @@ def test_a_film_that_opencv_cannot_decode_is_read_or_its_codec_is_named(
     )
     if codec is None:
         pytest.skip("this build of PyAV writes no AV1")
-    film = tmp_path / f"film.{ending}"
+    path = tmp_path / f"film.{ending}"
     greys = [60 + 20 * i for i in range(6)]
-    with av.open(str(film), "w") as out:
+    with av.open(str(path), "w") as out:
         stream = out.add_stream(codec, rate=10)
         stream.width = 64
         stream.height = 64
         stream.pix_fmt = "yuv420p"
         for grey in greys:
-            picture = av.VideoFrame.from_ndarray(
-                np.full((64, 64, 3), grey, np.uint8), format="rgb24"
-            )
-            out.mux(stream.encode(picture))
+            image = av.VideoFrame.from_ndarray(np.full((64, 64, 3), grey, np.uint8), format="rgb24")
+            out.mux(stream.encode(image))
         out.mux(stream.encode())
-    frames = list(images.timed_frames(film))
+    frames = list(images.timed_frames(path))
     assert [round(time, 2) for time, _ in frames] == pytest.approx(
         [i / 10 for i in range(6)], abs=0.01
     )
     np.testing.assert_allclose([frame.mean() for _, frame in frames], greys, atol=3)
-    video = images.open_video(film)
+    video = images.open_video(path)
     for frame, grey in ((4, 140), (1, 80)):
         assert video.set(cv2.CAP_PROP_POS_FRAMES, frame) and video.read()[
             1
         ].mean() == pytest.approx(grey, abs=3)
     monkeypatch.setitem(sys.modules, "av", None)
-    refused(r"of the codec AV01: pip install 'anytouch_jax\[lerobot\]'", images.open_video, film)
+    refused(r"of the codec AV01: pip install 'anytouch_jax\[lerobot\]'", images.open_video, path)

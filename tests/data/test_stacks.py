@@ -29,13 +29,13 @@ def test_every_frame_of_a_stack_is_read(tmp_path, form):
         np.testing.assert_array_equal(np.stack(frames_of(tmp_path / name)), wanted)
 
 
-def test_one_picture_and_other_files_are_no_stack(tmp_path):
+def test_one_image_and_other_files_are_no_stack(tmp_path):
     np.save(tmp_path / "one.npy", FRAMES[0])
     np.save(tmp_path / "grey.npy", FRAMES[0, ..., 0])
-    (tmp_path / "film.mp4").write_bytes(b"")
-    for name in ("one.npy", "grey.npy", "film.mp4", "gone.npy", "."):
+    (tmp_path / "video.mp4").write_bytes(b"")
+    for name in ("one.npy", "grey.npy", "video.mp4", "gone.npy", "."):
         assert read_stack(tmp_path / name) is None
-    np.savez(tmp_path / "one.npz", picture=FRAMES[0])
+    np.savez(tmp_path / "one.npz", image=FRAMES[0])
     assert len(frames_of(tmp_path / "one.npz")) == 1
 
 

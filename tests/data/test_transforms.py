@@ -57,7 +57,7 @@ def test_flips_are_exact_mirrors_in_all_four_forms():
 
 
 def _blob(affine, key):
-    """Area of a disc after a map, and its place from the middle, as fractions of the picture."""
+    """Area of a disc after a map, and its place from the middle, as fractions of the image."""
     disc = cv2.circle(np.zeros((64, 64, 3), np.uint8), (32, 32), 10, (255, 255, 255), -1)
     out = t.touch_transform([disc], 64, _rng(key), replace(PLAIN, affine=affine))[0, ..., 0] / 255
     rows, columns = np.indices(out.shape)
@@ -139,7 +139,7 @@ def test_jitter_is_torchvisions_within_half_a_level(key):
     assert np.abs(got - want).max() <= 0.51
 
 
-def test_all_frames_of_a_clip_share_one_draw():
+def test_all_frames_of_a_clip_fraction_one_draw():
     same = np.stack([CLIP[0]] * 4)
     out = t.touch_transform(same, 16, _rng(5), DataConfig())
     for frame in out[1:]:
@@ -162,7 +162,7 @@ def test_augmentation_is_a_function_of_seed_epoch_and_row():
 
 
 @pytest.mark.parametrize("shape", [(30, 50), (50, 30), (20, 20), (9, 14), (400, 300), (401, 30)])
-def test_vision_keeps_a_flat_picture_flat_at_any_size(shape):
+def test_vision_keeps_a_flat_image_flat_at_any_size(shape):
     out = t.vision_evaluation(np.full((*shape, 3), (10, 130, 250), np.uint8), 20)
     assert out.shape == (20, 20, 3) and out.dtype == np.uint8
     np.testing.assert_array_equal(out, np.broadcast_to(np.array([10, 130, 250]), out.shape))
@@ -171,9 +171,9 @@ def test_vision_keeps_a_flat_picture_flat_at_any_size(shape):
 @pytest.mark.parametrize(("excess", "start"), [(3, 2), (5, 2), (7, 4)])
 def test_an_odd_excess_is_cropped_as_clip_crops_it(excess, start):
     """torchvision's CenterCrop, round((n - size) / 2): a half goes to the even number."""
-    picture = RNG.integers(0, 256, (20, 20 + excess, 3), np.uint8)
-    np.testing.assert_array_equal(t.vision_evaluation(picture, 20), picture[:, start : start + 20])
-    upright = picture.transpose(1, 0, 2).copy()
+    image = RNG.integers(0, 256, (20, 20 + excess, 3), np.uint8)
+    np.testing.assert_array_equal(t.vision_evaluation(image, 20), image[:, start : start + 20])
+    upright = image.transpose(1, 0, 2).copy()
     np.testing.assert_array_equal(t.vision_evaluation(upright, 20), upright[start : start + 20])
 
 
@@ -201,10 +201,10 @@ def test_vision_resize_is_bicubic():
 
 
 def test_vision_flip_is_an_exact_mirror_and_rotation_turns():
-    picture = RNG.integers(0, 256, (20, 20, 3), np.uint8)
-    mirrored = t.vision_transform(picture, 20, _rng(), rotation=0.0, flip=1.0)
-    np.testing.assert_array_equal(mirrored, t.vision_evaluation(picture[:, ::-1], 20))
-    np.testing.assert_array_equal(t.vision_transform(picture, 20, _rng(), 0.0, 0.0), picture)
+    image = RNG.integers(0, 256, (20, 20, 3), np.uint8)
+    mirrored = t.vision_transform(image, 20, _rng(), rotation=0.0, flip=1.0)
+    np.testing.assert_array_equal(mirrored, t.vision_evaluation(image[:, ::-1], 20))
+    np.testing.assert_array_equal(t.vision_transform(image, 20, _rng(), 0.0, 0.0), image)
     bar = np.zeros((101, 101, 3), np.uint8)
     bar[48:53] = 255
     angles = []

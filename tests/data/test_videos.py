@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from films import write_film
+from videos import write_video
 
 from anytouch_jax.data import images
 
@@ -23,13 +23,13 @@ QUICKLY = {"libx264": {"crf": "5"}, "libsvtav1": {"crf": "10", "preset": "12"}}
 
 
 def corners() -> np.ndarray:
-    """A picture RGB whose corners differ: from the left, above red and green, below blue, white."""
-    picture = np.full((*SHAPE, 3), 128, np.uint8)
-    picture[:32, :32] = RED
-    picture[:32, -32:] = GREEN
-    picture[-32:, :32] = BLUE
-    picture[-32:, -32:] = WHITE
-    return picture
+    """An image RGB whose corners differ: from the left, above red and green, below blue, white."""
+    image = np.full((*SHAPE, 3), 128, np.uint8)
+    image[:32, :32] = RED
+    image[:32, -32:] = GREEN
+    image[-32:, :32] = BLUE
+    image[-32:, -32:] = WHITE
+    return image
 
 
 def encoded(
@@ -85,7 +85,7 @@ def assert_corners(frame: np.ndarray, *wanted: tuple[int, int, int]) -> None:
     ],
 )
 def test_a_turned_video_is_upright_whatever_its_codec(tmp_path, codec, degrees, wanted):
-    path = encoded(tmp_path / "film.mp4", codec)
+    path = encoded(tmp_path / "video.mp4", codec)
     if degrees:
         turn(path, degrees)
     height, width = SHAPE if degrees in (0, 180) else SHAPE[::-1]
@@ -105,7 +105,7 @@ def test_a_turned_video_is_upright_whatever_its_codec(tmp_path, codec, degrees, 
 @pytest.mark.parametrize("pixel", [Fraction(4, 3), Fraction(1, 2), Fraction(1)])
 def test_pixels_are_square_as_the_video_is_meant_to_be_shown(tmp_path, codec, degrees, pixel):
     """The shape of a pixel is that before the turn."""
-    path = encoded(tmp_path / "film.mp4", codec, pixel=pixel)
+    path = encoded(tmp_path / "video.mp4", codec, pixel=pixel)
     if degrees:
         turn(path, degrees)
     height, width = SHAPE[0], round(SHAPE[1] * pixel)
@@ -118,7 +118,7 @@ def test_pixels_are_square_as_the_video_is_meant_to_be_shown(tmp_path, codec, de
 @pytest.mark.parametrize("codec", CODECS)
 @pytest.mark.parametrize("ending", ["mp4", "mkv"])
 def test_time_counts_from_the_start_of_a_video(tmp_path, codec, ending):
-    path = encoded(tmp_path / f"film.{ending}", codec, start=50)
+    path = encoded(tmp_path / f"video.{ending}", codec, start=50)
     times = [time for time, _ in images.timed_frames(path)]
     assert times == pytest.approx([0, 0.1, 0.2, 0.3], abs=0.01)
 
@@ -126,15 +126,17 @@ def test_time_counts_from_the_start_of_a_video(tmp_path, codec, ending):
 @pytest.mark.parametrize("wide", [1, 2])
 def test_colours_are_the_same_in_both_ranges_and_by_both_decoders(tmp_path, wide):
     for codec in CODECS:
-        frame = next(images.frames_from_video(encoded(tmp_path / "film.mp4", codec, wide=wide)))
+        frame = next(images.frames_from_video(encoded(tmp_path / "video.mp4", codec, wide=wide)))
         assert_corners(frame, RED, GREEN, BLUE, WHITE)
 
 
 def test_a_shape_of_pixels_that_makes_a_strip_is_refused(tmp_path):
     """Muxers write none, so a damaged header is made up."""
-    video = images.open_video(encoded(tmp_path / "film.mp4", "h264"))
+    video = images.open_video(encoded(tmp_path / "video.mp4", "h264"))
     video._stretch = 200
-    with pytest.raises(images.ImageError, match=r"film.mp4 has 25600 x 96 pixels: that is a strip"):
+    with pytest.raises(
+        images.ImageError, match=r"video.mp4 has 25600 x 96 pixels: that is a strip"
+    ):
         video.read()
 
 
@@ -142,9 +144,9 @@ def test_a_shape_of_pixels_that_makes_a_strip_is_refused(tmp_path):
 def test_names_that_are_not_utf_8_are_read(tmp_path, kind):
     """In a process of its own, because OpenCV ends the process for such a name."""
     if kind == "avi":
-        made = write_film(tmp_path / "film.avi", [corners()[..., ::-1]] * 3)
+        made = write_video(tmp_path / "video.avi", [corners()[..., ::-1]] * 3)
     else:
-        made = encoded(tmp_path / "film.mp4", "av1")
+        made = encoded(tmp_path / "video.mp4", "av1")
     folder = os.fsencode(tmp_path) + b"/Pr\xfcfstand"
     name = folder + b"/dr\xfccken" + os.fsencode(made.suffix)
     os.mkdir(folder)
@@ -169,19 +171,19 @@ def test_names_that_are_not_utf_8_are_read(tmp_path, kind):
 
 def test_a_video_is_written_under_a_name_that_is_not_utf_8(tmp_path):
     """In a process of its own, for the same reason."""
-    name = os.fsencode(tmp_path) + b"/gr\xfcn/film.mp4"
+    name = os.fsencode(tmp_path) + b"/gr\xfcn/video.mp4"
     code = (
         "import os, sys\n"
         "from pathlib import Path\n"
         "import numpy as np\n"
         "from anytouch_jax.data.images import frames_from_video\n"
-        "from anytouch_jax.fields.film import Film\n"
+        "from anytouch_jax.fields.video import Video\n"
         "path = Path(os.fsdecode(bytes.fromhex(sys.argv[1])))\n"
         "path.parent.mkdir()\n"
-        "film = Film(path)\n"
+        "video = Video(path)\n"
         "for grey in (50, 100, 150):\n"
-        "    film.add(np.full((64, 64, 3), grey, np.uint8))\n"
-        "film.finish()\n"
+        "    video.add(np.full((64, 64, 3), grey, np.uint8))\n"
+        "video.finish()\n"
         "print([int(round(frame.mean(), -1)) for frame in frames_from_video(path)])\n"
         "print([file.name for file in path.parent.iterdir()])\n"
     )
@@ -189,4 +191,4 @@ def test_a_video_is_written_under_a_name_that_is_not_utf_8(tmp_path):
         [sys.executable, "-c", code, name.hex()], capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
-    assert done.stdout.splitlines() == ["[50, 100, 150]", "['film.mp4']"]
+    assert done.stdout.splitlines() == ["[50, 100, 150]", "['video.mp4']"]

@@ -24,57 +24,55 @@ def _recording(make, count=12, shape=(48, 64), seed=0):
     return loose
 
 
-def _cut_jpeg(picture):
-    """The picture as a decoder gives it from a JPEG file with a lost end and an end marker."""
-    data = cv2.imencode(".jpg", picture)[1].tobytes()
+def _cut_jpeg(image):
+    """The image as a decoder gives it from a JPEG file with a lost end and an end marker."""
+    data = cv2.imencode(".jpg", image)[1].tobytes()
     return cv2.imdecode(
         np.frombuffer(data[: len(data) // 2] + b"\xff\xd9", np.uint8), cv2.IMREAD_COLOR
     )
 
 
-def _with_bars(picture):
-    picture[:4] = picture[-4:] = 0
-    return picture
+def _with_bars(image):
+    image[:4] = image[-4:] = 0
+    return image
 
 
 SPOILS = {
-    "flat": lambda picture: np.full_like(picture, 77),
+    "flat": lambda image: np.full_like(image, 77),
     "cut": _cut_jpeg,
     "border": _with_bars,
-    "noise": lambda picture: np.random.default_rng(1).integers(0, 256, picture.shape, np.uint8),
-    "grey": lambda picture: np.repeat(picture.mean(axis=2, keepdims=True), 3, axis=2).astype(
-        np.uint8
-    ),
-    "dark": lambda picture: picture // 8,
-    "inverted": lambda picture: 255 - picture,
-    "channels": lambda picture: picture[..., ::-1],
-    "turned": lambda picture: picture[::-1, ::-1],
-    "wrong_size": lambda picture: picture[::2, ::2],
+    "noise": lambda image: np.random.default_rng(1).integers(0, 256, image.shape, np.uint8),
+    "grey": lambda image: np.repeat(image.mean(axis=2, keepdims=True), 3, axis=2).astype(np.uint8),
+    "dark": lambda image: image // 8,
+    "inverted": lambda image: 255 - image,
+    "channels": lambda image: image[..., ::-1],
+    "turned": lambda image: image[::-1, ::-1],
+    "wrong_size": lambda image: image[::2, ::2],
 }
 
 
 @pytest.mark.parametrize("kind", SPOILS)
-def test_a_picture_that_cannot_be_right_is_named(make, kind):
+def test_a_image_that_cannot_be_right_is_named(make, kind):
     loose = _recording(make)
     assert verify(loose).findings == ()
-    picture = cv2.imread(str(loose.file(7)))
-    cv2.imwrite(str(loose.file(7)), SPOILS[kind](picture.copy()))
+    image = cv2.imread(str(loose.file(7)))
+    cv2.imwrite(str(loose.file(7)), SPOILS[kind](image.copy()))
     report = verify(loose)
     assert finding_rows(report) == {kind: [7]} and report.ok
     assert "'f7.png'" in report.findings[0].examples[0]
 
 
-def test_a_mirrored_picture_is_turned(make):
+def test_a_mirrored_image_is_turned(make):
     for spoil in (
-        lambda picture: picture[:, ::-1],
-        lambda picture: cv2.resize(np.rot90(picture), (64, 48)),
+        lambda image: image[:, ::-1],
+        lambda image: cv2.resize(np.rot90(image), (64, 48)),
     ):
         loose = _recording(make)
         cv2.imwrite(str(loose.file(3)), spoil(cv2.imread(str(loose.file(3)))))
         assert finding_rows(verify(loose)) == {"turned": [3]}
 
 
-def test_a_camera_that_hangs_repeats_its_picture(make):
+def test_a_camera_that_hangs_repeats_its_image(make):
     loose = _recording(make)
     # other bytes, equal pixels
     for row in (5, 6, 7):
@@ -87,17 +85,17 @@ def test_a_camera_that_hangs_repeats_its_picture(make):
 def test_a_sequence_of_several_sensors_is_noticed(make, sensors):
     loose = _recording(make, 16)
     for row in range(16):
-        picture = cv2.imread(str(loose.file(row))).astype(int)
+        image = cv2.imread(str(loose.file(row))).astype(int)
         cv2.imwrite(
-            str(loose.file(row)), np.clip(picture + 12 * (row % sensors), 0, 255).astype(np.uint8)
+            str(loose.file(row)), np.clip(image + 12 * (row % sensors), 0, 255).astype(np.uint8)
         )
     assert finding_rows(verify(loose)) == {"alternating": list(range(16))}
 
 
-def test_a_picture_that_is_odd_in_its_sequence_only_has_a_wrong_size(make):
+def test_a_image_that_is_odd_in_its_sequence_only_has_a_wrong_size(make):
     loose = _recording(make, 9)
     for row in range(9):
-        picture = cv2.imread(str(loose.file(row)))
-        cv2.imwrite(str(loose.file(row)), picture if row != 2 else picture[::2, ::2])
+        image = cv2.imread(str(loose.file(row)))
+        cv2.imwrite(str(loose.file(row)), image if row != 2 else image[::2, ::2])
     two = replace_column(loose, "sequence", ["a"] * 3 + ["b"] * 6)
     assert finding_rows(verify(two)) == {"wrong_size": [2]}

@@ -85,7 +85,7 @@ def _asked(manifest, folder, behave=None, **options):
         return _run(manifest, server, folder, **options), server
 
 
-def _pictures(body):
+def _images(body):
     return [
         part["image_url"]["url"]
         for part in body["messages"][1]["content"]
@@ -118,15 +118,13 @@ def test_one_question_a_sequence_with_the_photograph_of_its_middle_frame(make, t
         assert path == "/v1/chat/completions" and headers["Authorization"] == f"Bearer {KEY}"
         assert body["model"] == "gpt-4o" and body["response_format"] == {"type": "json_object"}
         assert body["max_tokens"] == 200 and body["temperature"] == 0.0
-    # The pictures are of one colour that tells the row: rows 1, 4, 7 are the middle frames.
-    seen = sorted(
-        round(float(_decoded(_pictures(body)[0])[..., 0].mean())) for body in server.asked
-    )
+    # The images are of one colour that tells the row: rows 1, 4, 7 are the middle frames.
+    seen = sorted(round(float(_decoded(_images(body)[0])[..., 0].mean())) for body in server.asked)
     assert np.abs(np.array(seen) - [2, 5, 8]).max() <= 1
     assert "photograph" in _words(server.asked[0])
 
 
-def test_one_photograph_or_touch_by_two_sensors_is_asked_about_once_with_small_pictures(
+def test_one_photograph_or_touch_by_two_sensors_is_asked_about_once_with_small_images(
     make, tmp_path
 ):
     rows = [
@@ -145,7 +143,7 @@ def test_one_photograph_or_touch_by_two_sensors_is_asked_about_once_with_small_p
     cv2.imwrite(str(tmp_path / "big.png"), np.zeros((300, 600, 3), np.uint8))
     done, server = _asked(loose, tmp_path / "answers", side=128)
     assert len(server.asked) == 2 and [len(c.job.rows) for c in done.captions] == [6, 1]
-    assert sorted(_decoded(_pictures(body)[0]).shape for body in server.asked) == [
+    assert sorted(_decoded(_images(body)[0]).shape for body in server.asked) == [
         (40, 40, 3),
         (64, 128, 3),
     ]
@@ -156,19 +154,19 @@ def test_objectfolder_sends_two_photographs_and_the_touch_and_says_so(make, tmp_
     cv2.imwrite(str(tmp_path / "side.png"), np.full((20, 20, 3), 200, np.uint8))
     done, server = _asked(loose, tmp_path / "answers")
     (body,) = server.asked
-    first, second, touch = (_decoded(url) for url in _pictures(body))
+    first, second, touch = (_decoded(url) for url in _images(body))
     assert (first.shape, second.shape, touch.shape) == ((40, 40, 3), (20, 20, 3), (12, 16, 3))
     assert abs(second.mean() - 200) < 2
-    assert "first two pictures are photographs" in _words(
+    assert "first two images are RGB images" in _words(
         body
-    ) and "last picture is the imprint" in _words(body)
+    ) and "last image is the imprint" in _words(body)
     assert [column for _, column in done.captions[0].job.images] == [
         "image_path",
         "image2_path",
         "path",
     ]
     _, server = _asked(make(_rows(1, "objectfolder_real")), tmp_path / "other")
-    assert len(_pictures(server.asked[0])) == 2 and "first picture is a photograph" in _words(
+    assert len(_images(server.asked[0])) == 2 and "first image is an RGB image" in _words(
         server.asked[0]
     )
 
@@ -184,7 +182,7 @@ def test_phrases_are_expanded_once_and_kept(make, tmp_path):
         done = _run(loose, server, tmp_path / "answers")
         words = sorted(map(_words, server.asked))
         assert len(words) == 2 and '"hard"' in words[0] and r'"soft, {fuzzy} \"wool\""' in words[1]
-        assert [len(_pictures(body)) for body in sorted(server.asked, key=_words)] == [0, 1]
+        assert [len(_images(body)) for body in sorted(server.asked, key=_words)] == [0, 1]
         assert done.manifest.column("text").to_pylist() == [GOOD["caption"]] * 5 + [None]
         assert done.manifest.column("phrase").to_pylist() == ['soft, {fuzzy} "wool"'] * 3 + [
             "hard"
@@ -225,7 +223,7 @@ def test_what_needs_no_caption_is_left_out_and_counted(make, tmp_path):
         "'mine' has no prompt" in reason and "--family mine" in reason for reason in left_out
     )
     several = make([row | {"dataset": f"mine {i % 3}"} for i, row in enumerate(_rows(2))])
-    told = refused(r"--family 'mine 2' photograph", find_caption_jobs, several)
+    told = refused(r"--family 'mine 2' RGB image", find_caption_jobs, several)
     assert told.count("touch_and_go") == 1
     assert len(find_caption_jobs(loose, families={"mine": "photograph"}, overwrite=True)[0]) == 3
     assert len(find_caption_jobs(loose, split="train")[0]) == 1
@@ -274,7 +272,7 @@ def test_an_answer_is_paid_for_once(make, tmp_path):
     with serve(behave) as server:
         first = _run(loose, server, tmp_path / "answers", threads=2)
         assert server.most == 2
-        # the same pictures
+        # the same images
         packed = manifests.read(pack(loose, tmp_path / "out"))
         for same in (loose, packed):
             again = _run(
@@ -284,7 +282,7 @@ def test_an_answer_is_paid_for_once(make, tmp_path):
             assert again.manifest.column("text") == first.manifest.column("text")
         cv2.imwrite(str(loose.file(1, "image_path")), np.full((9, 9, 3), 7, np.uint8))
         _run(loose, server, tmp_path / "answers")
-        assert len(server.asked) == 5  # another picture, another question
+        assert len(server.asked) == 5  # another image, another question
         _run(loose, server, tmp_path / "answers", endpoint={"max_tokens": 300})
         assert len(server.asked) == 9
     entry = json.loads((tmp_path / "answers" / "answers.jsonl").read_text().splitlines()[0])
@@ -409,7 +407,7 @@ def test_bad_answers_are_asked_again_then_counted_and_listed(make, tmp_path):
     loose = make(_rows(3))
 
     def behave(number, body):
-        row = round(float(_decoded(_pictures(body)[0])[..., 0].mean()))
+        row = round(float(_decoded(_images(body)[0])[..., 0].mean()))
         return 200, {}, chat(answers[number % len(answers)] if row < 4 else GOOD)
 
     done, server = _asked(loose, tmp_path / "answers", behave, threads=2)
@@ -533,7 +531,7 @@ def test_other_servers_can_be_spoken_to():
         assert _ask(server)[:2] == ("I will not", "refusal")
 
 
-def test_the_sheet_holds_its_pictures_and_escapes_words(make, tmp_path):
+def test_the_sheet_holds_its_images_and_escapes_words(make, tmp_path):
     loose = make(_rows(5))
     tricky = {"object": "<script>", "caption": "Soft & <b>warm</b> to the touch."}
     done, _ = _asked(loose, tmp_path / "answers", lambda *_: (200, {}, chat(tricky)))
@@ -551,7 +549,7 @@ def test_the_sheet_holds_its_pictures_and_escapes_words(make, tmp_path):
     refused("no captions", sample_sheet, done.manifest, (), tmp_path / "none.html")
 
 
-def test_many_pictures_that_cannot_be_read_bar_no_question(make, tmp_path):
+def test_many_images_that_cannot_be_read_bar_no_question(make, tmp_path):
     loose = make(_rows(40))
     loose.file(1, "image_path").unlink()
     for job in range(1, 30):

@@ -29,7 +29,7 @@ def _closed():
 
 
 def _rows(sequences=4, length=6):
-    """Two sensors at the same places, with pictures (one shared by a sequence), captions and a
+    """Two sensors at the same places, with images (one shared by a sequence), captions and a
     background each.
     """
     return [
@@ -136,7 +136,7 @@ def test_joined_manifests_keep_their_keys_apart(make, settings, tmp_path):
     two = make(_rows(2), "two")
     for name, manifest in (("one", one), ("two", two)):
         manifests.write(manifest, tmp_path / name / "manifest.csv")
-    # another picture under the same name
+    # another image under the same name
     for row in range(12):
         cv2.imwrite(str(two.file(row)), np.full((12, 16, 3), 240 - row, np.uint8))
     both = manifests.read([tmp_path / "one" / "manifest.csv", tmp_path / "two" / "manifest.csv"])
@@ -286,14 +286,14 @@ def test_damage_is_one_sentence_with_shard_and_row(make, settings, tmp_path, har
     assert "touch/00000.zip/7" in error
     if harm == "flip":
         assert decode(again.file(6)).shape == (12, 16, 3)
-        loader = Loader(again, settings(1, threads=2, batch_size=24, clip_share=0.0))
+        loader = Loader(again, settings(1, threads=2, batch_size=24, clip_fraction=0.0))
         refused(
             r"row \d+ of .*manifest\.parquet, column 'path': .*00000\.zip/",
             list,
             loader.stream(0, 1),
         )
         loader = Loader(
-            again, settings(1, threads=2, batch_size=24, clip_share=0.0, on_bad_sample="skip")
+            again, settings(1, threads=2, batch_size=24, clip_fraction=0.0, on_bad_sample="skip")
         )
         ((_, _, info),) = loader.stream(0, 1)
         assert info["skipped_samples"] >= 1
@@ -349,7 +349,7 @@ def test_what_is_no_regular_file_is_refused_and_never_waited_for(tmp_path, monke
     refused("11 bytes, more than the limit of 10", decode, tmp_path / "big.png")
 
 
-def test_a_finished_pack_is_left_alone_and_other_pictures_are_another_pack(
+def test_a_finished_pack_is_left_alone_and_other_images_are_another_pack(
     make, tmp_path, monkeypatch
 ):
     loose = make(_rows())
@@ -357,8 +357,8 @@ def test_a_finished_pack_is_left_alone_and_other_pictures_are_another_pack(
     with monkeypatch.context() as changed:
         changed.setattr(packing, "read_file", lambda path: pytest.fail("it was packed again"))
         assert pack(loose, tmp_path / "out") == target
-    picture = loose.file(0)
-    picture.write_bytes(picture.read_bytes() + b"more")
+    image = loose.file(0)
+    image.write_bytes(image.read_bytes() + b"more")
     refused("have changed since", pack, loose, tmp_path / "out")
     for row in range(len(loose)):
         loose.file(row).unlink(missing_ok=True)  # packed and done with

@@ -45,7 +45,7 @@ def test_a_clean_manifest_has_no_findings(make):
     report = verify(make(plain_rows(license="MIT")))
     assert report.ok and report.findings == () and (report.rows, report.files) == (6, 6)
     assert report.splits == {"train": 6}
-    assert report.shares == {"d": dict.fromkeys(report.shares["d"], 0.0) | {"license": 1.0}}
+    assert report.fractions == {"d": dict.fromkeys(report.fractions["d"], 0.0) | {"license": 1.0}}
     assert "No fault was found" in report.to_markdown()
     assert json.loads(report.to_json())["ok"] is True
 
@@ -106,7 +106,7 @@ def test_a_bad_file_is_found_named_and_repaired(make, tmp_path, how, column):
     assert not repair(manifests.read(target), verify(manifests.read(target))).done
 
 
-def test_a_frame_of_a_force_field_sensor_is_an_array_and_no_picture(make):
+def test_a_frame_of_a_force_field_sensor_is_an_array_and_no_image(make):
     loose = make([{}, {}])
     columns = {name: loose.column(name).to_pylist() for name in loose.table.column_names}
     columns |= {
@@ -120,7 +120,7 @@ def test_a_frame_of_a_force_field_sensor_is_an_array_and_no_picture(make):
     assert report.ok and len(repair(manifest, report).manifest) == 2
 
 
-def test_odd_but_whole_pictures_are_no_fault(make):
+def test_odd_but_whole_images_are_no_fault(make):
     from PIL import Image
 
     loose = make(plain_rows(7))
@@ -235,10 +235,10 @@ def test_rows_that_differ_in_anything_are_not_repeats(make):
         ]
 
 
-def test_one_picture_as_touch_and_as_photograph(make):
+def test_one_image_as_touch_and_as_photograph(make):
     loose = make(plain_rows(image_path="v.png"))
     shutil.copy(loose.file(4), loose.file(4, "image_path"))
-    assert finding_rows(verify(loose)) == {"touch_is_picture": [4]}
+    assert finding_rows(verify(loose)) == {"touch_is_image": [4]}
 
 
 @pytest.mark.parametrize("column", ["sequence", "touch", "grasp_group", "object"])
@@ -298,12 +298,10 @@ def test_a_name_of_a_sensor_within_two_letters_of_a_known_one_is_an_error(make):
 @pytest.mark.parametrize(
     ("bits", "suffix"), [(8, ".png"), (12, ".png"), (12, ".tiff"), (14, ".png"), (16, ".png")]
 )
-def test_pictures_that_use_fewer_bits_than_their_files_are_named_with_the_factor(
-    make, bits, suffix
-):
+def test_images_that_use_fewer_bits_than_their_files_are_named_with_the_factor(make, bits, suffix):
     manifest = make([{"path": f"{i}{suffix}", "sequence": "s", "frame_index": i} for i in range(4)])
     rng = np.random.default_rng(0)
-    # the last is darker, as the largest of all pictures counts
+    # the last is darker, as the largest of all images counts
     for row in range(4):
         most = 2**bits >> (row == 3)
         noise = cv2.resize(rng.random((6, 8, 3)), (40, 30), interpolation=cv2.INTER_CUBIC).clip(
@@ -379,8 +377,8 @@ def test_values_are_counted_by_data_set_and_lists_are_named(make):
     manifest = make(rows)
     window = pa.array([[1.0], None, [2.0, 3.0], [4.0], None, None])
     report = verify(replace(manifest, table=manifest.table.append_column("label.window", window)))
-    assert report.shares["a"]["text"] == 0.25 and report.shares["b"]["text"] == 0.5
-    assert report.shares["a"]["image_path"] == 0.5 and report.shares["b"]["image_path"] == 0.0
+    assert report.fractions["a"]["text"] == 0.25 and report.fractions["b"]["text"] == 0.5
+    assert report.fractions["a"]["image_path"] == 0.5 and report.fractions["b"]["image_path"] == 0.0
     assert report.labels == {"label.force": 3, "label.window": 3}
     page = report.to_markdown()
     assert "| a | 50% | 25% |" in page and "label.force 3, label.window 3" in page
@@ -414,7 +412,7 @@ def test_some_swapped_rows_are_pointed_at_and_what_is_not_swapped_is_not_suspect
     assert finding_rows(report)["swapped_rows"] == list(range(1, 24, 4))
     assert not repair(loose, report).done
     loose = image_pairs(tmp_path, make, swap=lambda i: False, witness=witness)
-    if not witness:  # a photograph is none
+    if not witness:  # an RGB image is none
         loose = replace_column(loose, "background_path", ["see3.png"] * 24)
     assert {"swapped", "swapped_rows"}.isdisjoint(finding_rows(verify(loose)))
 
@@ -462,7 +460,7 @@ def test_a_swapped_dataset_is_suspected_and_mended_only_with_a_witness(make, tmp
 
 def test_an_exchanged_row_lives_by_its_new_touch_image(make, tmp_path):
     loose = image_pairs(tmp_path, make, swap=lambda i: True, witness=True)
-    (tmp_path / "touch3.png").unlink()  # a photograph, in truth
+    (tmp_path / "touch3.png").unlink()  # an RGB image, in truth
     (tmp_path / "see5.png").write_bytes(b"")  # a touch image, in truth
     fixed = repair(loose, verify(loose), swap=["tvl"])
     kept = fixed.manifest.column("path").to_pylist()

@@ -95,7 +95,7 @@ def test_an_encoder_of_a_run_keeps_the_touch_encoder_only(encoder, tiny_run):
     np.testing.assert_array_equal(wanted, encoder.encode_touch(CLIPS[:, 0], "digit"))
 
 
-def test_a_manifest_gives_what_its_pictures_give(encoder, world):
+def test_a_manifest_gives_what_its_images_give(encoder, world):
     manifest = manifests.read(world)
     lines = []
     rows, values = embed_rows(encoder, manifest, np.asarray([9, 0, 5]), batch=2, log=lines.append)

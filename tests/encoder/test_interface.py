@@ -5,8 +5,8 @@ import contextlib
 import cv2
 import numpy as np
 import pytest
-from films import write_film
 from tiny_models import touch_model
+from videos import write_video
 
 import anytouch_jax as at
 from anytouch_jax.config import Config, DataConfig
@@ -42,7 +42,7 @@ class MeanColours(TouchEncoder):
             frame = cv2.subtract(frame, background)
         return cv2.resize(frame, (SIDE, SIDE), interpolation=cv2.INTER_AREA)
 
-    def encode_touch(self, frames, sensor="universal", *, pooling="class", join="mean"):
+    def encode_touch(self, frames, sensor="universal", *, pooling="class", aggregation="mean"):
         colours = np.asarray(frames, np.float32).mean((1, 2, 3)) / 255
         sensors = self.config.model.sensors
         rows = rows_of_sensors(sensor, len(frames), self.sensor_row, len(sensors))
@@ -60,11 +60,11 @@ def test_it_embeds_rows_and_frames_in_batches(table, world):
     assert rows.tolist() == [0, 1, 2, 3, 4] and values.shape == (5, 4)
     # gelsight_mini is row 3 of the table of sensors, digit row 1
     assert values[:, 3].tolist() == [1, 1, 1, 1, 3]
-    pictures = [cv2.imread(str(world.parent / f"a{i}.png"))[..., ::-1] for i in range(4)]
-    named = [(number, "", frame) for number, frame in enumerate(pictures)]
+    images = [cv2.imread(str(world.parent / f"a{i}.png"))[..., ::-1] for i in range(4)]
+    named = [(number, "", frame) for number, frame in enumerate(images)]
     clips = embed_frames(encoder, named, 1, length=3)
     assert clips.rows.tolist() == [2, 3]
-    touches = (encoder.prepare(picture)[None] for picture in pictures)
+    touches = (encoder.prepare(image)[None] for image in images)
     by_hand = run_in_batches(lambda part: encoder.encode_touch(part, "digit"), touches, size=3)
     np.testing.assert_allclose(by_hand, values[:4], atol=1e-6)
 
@@ -81,10 +81,10 @@ def test_probes_learn_from_its_features(table):
 
 def test_a_stream_takes_it(tmp_path):
     encoder = MeanColours()
-    film = write_film(
-        tmp_path / "film.avi", [np.full((32, 32, 3), value, np.uint8) for value in (40, 180)]
+    video = write_video(
+        tmp_path / "video.avi", [np.full((32, 32, 3), value, np.uint8) for value in (40, 180)]
     )
-    source, live = open_source(str(film))
+    source, live = open_source(str(video))
     with contextlib.closing(stream(encoder, source, live=live, sensor=1)) as frames:
         values = np.stack([frame.values for frame in frames])
     np.testing.assert_allclose(values[:, 0] * 255, [40, 180], atol=3)

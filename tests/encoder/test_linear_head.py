@@ -10,7 +10,7 @@ from anytouch_jax.encoder import linear_head
 from anytouch_jax.encoder.linear_head import LinearHead
 
 RECORDINGS = 300
-SHARE = 0.9
+FRACTION = 0.9
 
 
 def recordings_of_unequal_length(rng):
@@ -29,11 +29,11 @@ def test_a_limit_covers_new_recordings_when_the_hard_ones_are_short():
     rng = np.random.default_rng(0)
     covered = []
     for _ in range(20):
-        limit = linear_head.conformal_limit(*recordings_of_unequal_length(rng), SHARE)
+        limit = linear_head.conformal_limit(*recordings_of_unequal_length(rng), FRACTION)
         scores, recording = recordings_of_unequal_length(rng)
         inside = np.bincount(recording, scores <= limit) / np.bincount(recording)
         covered.append(inside.mean())
-    assert abs(np.mean(covered) - SHARE) < 0.02, np.mean(covered)
+    assert abs(np.mean(covered) - FRACTION) < 0.02, np.mean(covered)
 
 
 @pytest.mark.parametrize(

@@ -29,9 +29,9 @@ def touches(rng, groups, rows=6, sensor_shift=0.0):
     return x.astype(np.float32), np.array(list("abcd"))[y], group, sensors
 
 
-def calibrated(x, y, groups, sensors, share=0.8, **options):
+def calibrated(x, y, groups, sensors, fraction=0.8, **options):
     fit, val = (
-        np.flatnonzero((groups < share * groups.max()) == is_fit) for is_fit in (True, False)
+        np.flatnonzero((groups < fraction * groups.max()) == is_fit) for is_fit in (True, False)
     )
     names, numbers = np.unique(y, return_inverse=True)
     (model,) = heads.linear_path(x[fit], numbers[fit], (0.01,))
@@ -60,9 +60,9 @@ def test_a_limit_covers_new_groups_as_often_as_asked(alike, count, above):
 def test_too_few_recordings_promise_nothing(groups, is_finite):
     limit = novelty.conformal_limit(np.arange(groups, dtype=float), np.arange(groups), 0.9)
     assert np.isfinite(limit) == is_finite
-    for share in (0.0, 1.0, np.nan, None):
+    for fraction in (0.0, 1.0, np.nan, None):
         with pytest.raises(UserError, match="between 0 and 1"):
-            novelty.conformal_limit(np.zeros(groups), np.arange(groups), share)
+            novelty.conformal_limit(np.zeros(groups), np.arange(groups), fraction)
     for scores in ([], [np.nan] * groups, [0.5] * (groups - 1)):
         with pytest.raises(UserError, match="without NaN"):
             novelty.conformal_limit(scores, np.arange(len(scores) // groups * groups), 0.9)
@@ -214,7 +214,7 @@ def test_sets_of_a_head_hold_the_class_of_new_recordings_of_any_length():
         y = np.array(list("abcd"))[group % CLASSES]
         known = group < 150
         sensors = np.full(len(y), "digit")
-        head = calibrated(x[known], y[known], group[known], sensors[known], share=0.4)
+        head = calibrated(x[known], y[known], group[known], sensors[known], fraction=0.4)
         seen = head.assess(x[~known])
         truth = np.searchsorted(head.classes, y[~known])
         inside = seen.in_set[np.arange(len(truth)), truth]

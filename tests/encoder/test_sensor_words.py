@@ -40,7 +40,7 @@ def test_it_is_measured_in_its_own_mm_and_newtons(weights, mine):
     np.testing.assert_allclose(own.force / named.force, 60 / fields.OTHER_MODULUS, rtol=1e-5)
     assert not any("not in this model's table" in line for line in lines)
     assert any("tripod" in line and "universal" in line for line in lines)
-    # a cropped picture
+    # a cropped image
     assert encoder.measure(gel(), None, str(mine), width_mm=10.0, log=lines.append).width_mm == 10
     turned = np.ascontiguousarray(np.rot90(gel()))
     assert encoder.measure(turned, None, str(mine), log=lines.append).faults

@@ -30,7 +30,7 @@ from anytouch_jax.training import pretrain
 RNG = np.random.default_rng(0)
 FRAMES = RNG.integers(0, 256, (70, 1, 28, 28, 3), np.uint8)
 GOLDEN = Path(__file__).parents[1] / "parity" / "golden_others"
-PICTURE = RNG.integers(0, 256, (40, 30, 3), np.uint8)
+IMAGE = RNG.integers(0, 256, (40, 30, 3), np.uint8)
 
 
 @pytest.fixture(scope="module")
@@ -46,14 +46,14 @@ def workers(tmp_path_factory):
     other = load_encoder(GOLDEN / "timm_vit.safetensors", heads=4)
     return {
         "encoder": (encoder, lambda one: one.encode_touch(FRAMES[:3], "digit")),
-        "towers": (encoder, lambda one: one.encode_image([PICTURE, PICTURE])),
+        "towers": (encoder, lambda one: one.encode_image([IMAGE, IMAGE])),
         "match": (encoder, lambda one: one.match(np.ones((3, 12)), np.ones((3, 12)))),
-        "family": (other, lambda one: one.encode_touch(np.stack([one.preprocess(PICTURE)] * 3))),
-        "preprocess": (Preprocess(encoder, PICTURE), lambda one: one(PICTURE)),
-        "preprocess of a family": (Preprocess(other), lambda one: one(PICTURE)),
+        "family": (other, lambda one: one.encode_touch(np.stack([one.preprocess(IMAGE)] * 3))),
+        "preprocess": (Preprocess(encoder, IMAGE), lambda one: one(IMAGE)),
+        "preprocess of a family": (Preprocess(other), lambda one: one(IMAGE)),
         "preprocess of an engine": (
             Preprocess(load_encoder(folder / "touch.onnx")),
-            lambda one: one(PICTURE),
+            lambda one: one(IMAGE),
         ),
         "exported": (load(folder / "touch.bin"), lambda one: one(FRAMES[:3])),
         "engine": (load_encoder(folder / "touch.onnx"), lambda one: one.encode_touch(FRAMES[:3])),
@@ -165,11 +165,11 @@ def test_few_numbers_of_rows_are_compiled_and_features_are_equal(workers, part, 
 
     words = SimpleNamespace(vocab_size=9, encode=ids)
     encoder.__dict__["tokenizer"] = words
-    pictures = RNG.integers(0, 256, (70, 28, 28, 3), np.uint8)
+    images = RNG.integers(0, 256, (70, 28, 28, 3), np.uint8)
     z = RNG.standard_normal((2, 70, 12))
     run = {
         "touch": lambda n: encoder.encode_touch(FRAMES[:n], np.arange(n) % 3),
-        "image": lambda n: encoder.encode_image(list(pictures[:n])),
+        "image": lambda n: encoder.encode_image(list(images[:n])),
         "text": lambda n: encoder.encode_text([str(i) for i in range(n)]),
         "match": lambda n: encoder.match(z[0, :n], z[1, :n]),
         "exported": lambda n: exported(FRAMES[:n], np.arange(n) % 3),

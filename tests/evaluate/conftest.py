@@ -8,8 +8,8 @@ from anytouch_jax.evaluate import feature_cache
 
 
 @pytest.fixture(scope="session")
-def pictures(tmp_path_factory):
-    return painted(tmp_path_factory.mktemp("pictures"))
+def images(tmp_path_factory):
+    return painted(tmp_path_factory.mktemp("images"))
 
 
 @pytest.fixture(scope="session")

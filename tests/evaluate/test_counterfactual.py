@@ -59,7 +59,7 @@ def test_touch_matters_where_only_touch_has_the_label():
     assert len(runs) == len(results["results"]) == 3
     gains = [
         {"task": key[1], "head": key[2], "protocol": key[3], "control": key[0]}
-        | paired_gain(runs[cf.REAL, *key[1:]], several, measured=False)
+        | paired_gain(runs[cf.REAL, *key[1:]], several, regression=False)
         for key, several in runs.items()
         if key[0] != cf.REAL
     ]

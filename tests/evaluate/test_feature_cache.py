@@ -39,7 +39,7 @@ def paint(file: Path, grey: int) -> None:
 
 
 def world(folder: Path, gel: int) -> Manifest:
-    """Three touches over a gel of grey `gel`; pictures without compression, so that all are of one
+    """Three touches over a gel of grey `gel`; images without compression, so that all are of one
     size.
     """
     folder.mkdir()
@@ -53,7 +53,7 @@ def world(folder: Path, gel: int) -> Manifest:
     return manifests.read(folder / "m.parquet")
 
 
-def test_packs_of_one_table_with_other_gels_share_no_features(tmp_path, subtracting):
+def test_packs_of_one_table_with_other_backgrounds_fraction_no_features(tmp_path, subtracting):
     one, two = (
         manifests.read(pack(world(tmp_path / str(gel), gel), tmp_path / f"packed{gel}"))
         for gel in (100, 40)
@@ -71,7 +71,7 @@ def test_packs_of_one_table_with_other_gels_share_no_features(tmp_path, subtract
     assert image_digest(one) != before
 
 
-def test_another_picture_of_the_gel_is_seen_in_the_same_process(tmp_path, subtracting):
+def test_another_image_of_the_gel_is_seen_in_the_same_process(tmp_path, subtracting):
     table = world(tmp_path / "world", 100)
     first = encoder_features(subtracting, table).get(ROWS, 1)
     paint(tmp_path / "world" / "background.bmp", 40)
@@ -81,9 +81,9 @@ def test_another_picture_of_the_gel_is_seen_in_the_same_process(tmp_path, subtra
     np.testing.assert_array_equal(again, second)
 
 
-def test_the_cache_goes_by_content(encoder, pictures, tmp_path):
+def test_the_cache_goes_by_content(encoder, images, tmp_path):
     plain: dict[str, Any] = {"folder": tmp_path}
-    store = encoder_features(encoder, pictures, **plain)
+    store = encoder_features(encoder, images, **plain)
     files = {store.file(1), store.file(3)}
     other = random_encoder(tiny_config(), seed=1)
     assert (
@@ -91,49 +91,49 @@ def test_the_cache_goes_by_content(encoder, pictures, tmp_path):
         != encoder_digest(encoder)
         == encoder_digest(random_encoder(tiny_config()))
     )
-    files.add(encoder_features(other, pictures, **plain).file(1))
+    files.add(encoder_features(other, images, **plain).file(1))
     for change in (
         {"pooling": "mean"},
-        {"join": "concat"},
+        {"aggregation": "concat"},
         {"order": "shuffled"},
         {"universal": True},
     ):
-        files.add(encoder_features(encoder, pictures, **plain | change).file(1))
+        files.add(encoder_features(encoder, images, **plain | change).file(1))
     files.add(encoder_features(encoder, simulated(objects=8), **plain).file(1))
     assert len(files) == 8
     copied = tmp_path / "elsewhere"
     copied.mkdir()
-    for name in ["ground.png", *pictures.column("path").to_pylist()]:
-        shutil.copy2(pictures.files[0].parent / name, copied / name)
+    for name in ["ground.png", *images.column("path").to_pylist()]:
+        shutil.copy2(images.files[0].parent / name, copied / name)
     manifests.write(
-        manifests.from_columns(pictures.table.to_pydict(), copied / "m.parquet"),
+        manifests.from_columns(images.table.to_pydict(), copied / "m.parquet"),
         copied / "m.parquet",
     )
     moved = manifests.read(copied / "m.parquet")
     assert encoder_features(encoder, moved, **plain).file(1) == store.file(1)
-    middle = copied / pictures.value(len(pictures) // 2 + 1, "path")
+    middle = copied / images.value(len(images) // 2 + 1, "path")
     middle.write_bytes(middle.read_bytes()[:-1] + b"x")  # of the same size
     rewritten = encoder_features(encoder, moved, **plain).file(1)
     assert rewritten != store.file(1)
-    (copied / pictures.value(0, "path")).write_bytes((copied / "ground.png").read_bytes())
+    (copied / images.value(0, "path")).write_bytes((copied / "ground.png").read_bytes())
     before = encoder_features(encoder, moved, **plain).file(1)
-    assert before != rewritten  # an equal table of other pictures
-    # another photograph of the gel
+    assert before != rewritten  # an equal table of other images
+    # another RGB image of the gel
     cv2.imwrite(str(copied / "ground.png"), np.full((32, 32, 3), 41, np.uint8))
     assert encoder_features(encoder, moved, **plain).file(1) != before
 
 
-def test_a_broken_cache_is_made_again(passes, encoder, pictures, tmp_path):
+def test_a_broken_cache_is_made_again(passes, encoder, images, tmp_path):
     rows = np.arange(4)
-    whole = encoder_features(encoder, pictures, folder=tmp_path)
+    whole = encoder_features(encoder, images, folder=tmp_path)
     values = whole.get(rows[:, None], 1)
     whole.file(1).write_bytes(whole.file(1).read_bytes()[:200])
-    again = encoder_features(encoder, pictures, folder=tmp_path)
+    again = encoder_features(encoder, images, folder=tmp_path)
     np.testing.assert_array_equal(again.get(rows[:, None], 1), values)
     assert passes == [4, 4]
 
 
-def test_the_order_of_frames(encoder, pictures):
+def test_the_order_of_frames(encoder, images):
     clips = np.arange(24).reshape(8, 3)
     rows = np.arange(8)
     np.testing.assert_array_equal(reorder_frames(clips, rows, "right"), clips)
@@ -147,9 +147,9 @@ def test_the_order_of_frames(encoder, pictures):
     np.testing.assert_array_equal(reorder_frames(clips[:, :1], rows, "shuffled"), clips[:, :1])
     with pytest.raises(UserError, match="backwards"):
         reorder_frames(clips, rows, "backwards")
-    ends = pictures.clips(3)[:6, -1]
+    ends = images.clips(3)[:6, -1]
     stores = {
-        o: encoder_features(encoder, pictures, order=o) for o in ("right", "shuffled", "repeated")
+        o: encoder_features(encoder, images, order=o) for o in ("right", "shuffled", "repeated")
     }
     values = {name: store.get(ends[:, None], 3) for name, store in stores.items()}
     stills = stores["right"].get(ends[:, None], 1)
@@ -200,11 +200,11 @@ def test_components_are_those_of_train() -> None:
     np.testing.assert_allclose(principal_components(wild, train, 2)[train], kept[train], atol=1e-5)
 
 
-def test_a_features_file_serves_its_rows_in_any_order(pictures, tmp_path):
+def test_a_features_file_serves_its_rows_in_any_order(images, tmp_path):
     values = np.random.default_rng(0).normal(size=(9, 4)).astype(np.float32)
     rows = np.arange(20, 2, -2)
     np.savez(tmp_path / "f.npz", features=values, rows=rows)
-    store = feature_cache.file_features(tmp_path / "f.npz", pictures)
+    store = feature_cache.file_features(tmp_path / "f.npz", images)
     np.testing.assert_array_equal(store.get(np.array([[4], [20]]), 3), values[[8, 0]])
 
 
@@ -218,8 +218,8 @@ def test_a_features_file_serves_its_rows_in_any_order(pictures, tmp_path):
         ({"about/frames": np.array("3")}, "--frames 3"),
     ],
 )
-def test_a_features_file_that_does_not_fit_is_refused(pictures, tmp_path, change, words):
+def test_a_features_file_that_does_not_fit_is_refused(images, tmp_path, change, words):
     arrays = {"features": np.ones((12, 4)), "rows": np.arange(12)} | change
     np.savez(tmp_path / "odd.npz", **arrays)
     with pytest.raises(UserError, match=f"odd.npz.*{words}"):
-        feature_cache.file_features(tmp_path / "odd.npz", pictures).get(np.arange(15)[:, None], 1)
+        feature_cache.file_features(tmp_path / "odd.npz", images).get(np.arange(15)[:, None], 1)

@@ -21,13 +21,13 @@ def repeated(times, *columns):
     return [np.repeat(column, times, axis=0) for column in columns]
 
 
-@pytest.mark.parametrize(("measured", "left_out"), [(False, False), (True, False), (False, True)])
-def test_more_frames_of_the_same_recordings_make_no_interval_narrower(measured, left_out):
+@pytest.mark.parametrize(("regression", "left_out"), [(False, False), (True, False), (False, True)])
+def test_more_frames_of_the_same_recordings_make_no_interval_narrower(regression, left_out):
     rng = np.random.default_rng(0)
     count, frames = 80, 16
     x = rng.standard_normal((count, WIDTH)).astype(np.float32)
     value = x[:, 0] + 0.8 * rng.standard_normal(count)
-    labels = value if measured else np.where(value > 0, "soft", "hard")
+    labels = value if regression else np.where(value > 0, "soft", "hard")
     groups = np.array([f"recording {number}" for number in range(count)])
     split = np.where(np.arange(count) % 2, "train", "test")
 
@@ -35,10 +35,10 @@ def test_more_frames_of_the_same_recordings_make_no_interval_narrower(measured, 
         if left_out:
             found = probing.leave_groups_out(x, labels, groups, penalties=(0.1,))
         else:
-            options = {"measured": measured, "seeds": 0}
+            options = {"regression": regression, "seeds": 0}
             head = ProbeHead(options=(0.1,))
             found = probing.probe_features(x, labels, groups, split, head, **options)
-        return np.array([found.low, found.r2 if measured else found.accuracy, found.high])
+        return np.array([found.low, found.r2 if regression else found.accuracy, found.high])
 
     once = interval(x, labels, groups, split)
     often = interval(*repeated(frames, x, labels, groups, split))
@@ -47,7 +47,7 @@ def test_more_frames_of_the_same_recordings_make_no_interval_narrower(measured, 
 
 
 def test_the_components_of_pixels_are_those_of_rows_that_are_not_tested():
-    """Else the control would know the pictures of the test, and the encoder would not."""
+    """Else the control would know the images of the test, and the encoder would not."""
     rng = np.random.default_rng(0)
     count = 48
     groups = np.array([f"thing {number // 4}" for number in range(count)])

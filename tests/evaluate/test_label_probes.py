@@ -1,4 +1,4 @@
-"""Probes of a label column of a manifest, by features of a file: no picture is read."""
+"""Probes of a label column of a manifest, by features of a file: no image is read."""
 
 import json
 from pathlib import Path
@@ -58,7 +58,7 @@ def test_a_measured_column_is_probed_by_regression(tmp_path):
     data, features = springs(tmp_path)
     results, said = probe(data, features, "stiffness", out=tmp_path / "o.json")
     linear, knn, constant = results
-    assert linear.measured and linear.r2 > 0.95 and linear.mae < 2 < linear.baseline_mae
+    assert linear.regression and linear.r2 > 0.95 and linear.mae < 2 < linear.baseline_mae
     assert (
         linear.low <= linear.r2 <= linear.high and linear.mae_low <= linear.mae <= linear.mae_high
     )
@@ -105,7 +105,7 @@ def test_a_number_is_predicted_for_groups_that_are_left_out(tmp_path):
     assert one.r2 > 0.95 and one.n_test == 96 and one.test_groups == 24
     # features that know the object alone say nothing of another one's stiffness
     thing = np.repeat(np.arange(24), 4)
-    known = leave_groups_out(np.eye(24)[thing], 10.25 + thing, thing, measured=True)
+    known = leave_groups_out(np.eye(24)[thing], 10.25 + thing, thing, regression=True)
     assert known.r2 < 0.1
 
 
@@ -170,8 +170,8 @@ def test_recordings_without_a_split_are_left_out_in_turn(tmp_path):
     assert sum("no split into train and test" in line for line in said) == 1
     (by_name,), said = probe(data, features, "object", leave_out="sequence")
     assert by_name == one and not any("no split" in line for line in said)
-    with pytest.raises(UserError, match="published"):
-        probe(data, features, "object", protocol="published")
+    with pytest.raises(UserError, match="released"):
+        probe(data, features, "object", protocol="released")
 
 
 def test_frames_of_one_recording_do_not_teach_each_other(tmp_path):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from anytouch_jax.evaluate import plots
-from anytouch_jax.evaluate.plots import ShareBar, smoothed
+from anytouch_jax.evaluate.plots import FractionBar, smoothed
 
 
 def read(path: Path) -> Any:
@@ -61,8 +61,8 @@ def test_loss_curves_hold_every_term(tmp_path: Path, drawn: list[Any]) -> None:
 
 def test_bars_with_intervals_and_chance(tmp_path: Path, drawn: list[Any]) -> None:
     series = {
-        "fine": {"a": ShareBar(0.2, 0.1, 0.35, 0.02), "b": ShareBar(0.6)},
-        "coarse": {"b": ShareBar(0.5, 0.4, 0.9)},
+        "fine": {"a": FractionBar(0.2, 0.1, 0.35, 0.02), "b": FractionBar(0.6)},
+        "coarse": {"b": FractionBar(0.5, 0.4, 0.9)},
     }
     plots.bars(tmp_path / "b.png", series)
     left, right = drawn[0].axes

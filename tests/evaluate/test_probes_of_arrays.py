@@ -79,7 +79,7 @@ def test_only_the_published_protocol_follows_the_labels_of_test() -> None:
     y = np.unique(labels, return_inverse=True)[1]
     train = split == "train"
     test = split == "test"
-    choices: dict[str, list[float]] = {"honest": [], "published": []}
+    choices: dict[str, list[float]] = {"grouped": [], "released": []}
     # labels of test as this very fit would have them
     for penalty in (10.0, 1e-4):
         written = y.copy()
@@ -89,8 +89,8 @@ def test_only_the_published_protocol_follows_the_labels_of_test() -> None:
             chosen.append(
                 linear_probe(*arguments, penalties=(10.0, 1e-4), protocol=protocol).penalty
             )  # type: ignore
-    assert choices["published"] == [10.0, 1e-4]
-    assert choices["honest"][0] == choices["honest"][1]
+    assert choices["released"] == [10.0, 1e-4]
+    assert choices["grouped"][0] == choices["grouped"][1]
 
 
 @EITHER
@@ -117,10 +117,10 @@ def test_a_group_that_gives_the_label_away_does_not_help_on_other_groups() -> No
     leaky = linear_probe(identity, label, group, inside)
     assert leaky.accuracy == 1.0
     assert any("24 groups" in note for note in leaky.notes)
-    honest = leave_groups_out(identity, label, group, folds=6)
-    assert honest.accuracy < 0.62
-    assert honest.test_groups == 24
-    assert honest.n_test == 240
+    grouped = leave_groups_out(identity, label, group, folds=6)
+    assert grouped.accuracy < 0.62
+    assert grouped.test_groups == 24
+    assert grouped.n_test == 240
 
 
 @EITHER

@@ -55,7 +55,7 @@ def score_tasks(
     *,
     cache: Any = None,
     head_names: Any = ("linear",),
-    protocols: Any = ("honest",),
+    protocols: Any = ("grouped",),
     **options: Any,
 ) -> list[dict[str, Any]]:
     """Results of one source of features: an encoder or a store."""
@@ -65,7 +65,7 @@ def score_tasks(
         source = FeatureSource(
             "encoder", feature_cache.encoder_features(of, world, folder=cache), of
         )
-    protocol = "published" if "published" in protocols else protocols[0]
+    protocol = "released" if "released" in protocols else protocols[0]
     report = probe_tasks(
         [source],
         world,
@@ -90,7 +90,7 @@ def test_a_label_in_the_features_is_predicted(task, head):
     assert (one["task"], one["head"], one["protocol"], one["metric"]) == (
         task,
         head,
-        "honest",
+        "grouped",
         "accuracy",
     )
 
@@ -112,19 +112,19 @@ def test_a_number_in_the_features_is_predicted():
     assert abs(one["chance"]) < 0.05
 
 
-def test_a_split_that_shares_objects_is_not_honest():
-    """Features that know the object, not its material: a split by picture rewards them, the honest
+def test_a_split_that_shares_objects_is_not_grouped():
+    """Features that know the object, not its material: a split by image rewards them, the grouped
     one does not.
     """
     shared = simulated(objects=40, each=4, shared=True)
     names = shared.codes("object")
     store = planted(lambda rows: np.eye(40)[names[rows]])
-    honest, published = score_tasks(
-        store, shared, ["material"], seeds=2, protocols=("honest", "published")
+    grouped, released = score_tasks(
+        store, shared, ["material"], seeds=2, protocols=("grouped", "released")
     )
-    assert published["mean"] == 1.0 and honest["mean"] < 0.5
-    assert any("groups" in note for note in honest["notes"])
-    assert honest["test"] == 40 * 4 * 2 and published["test"] == 40 * 2
+    assert released["mean"] == 1.0 and grouped["mean"] < 0.5
+    assert any("groups" in note for note in grouped["notes"])
+    assert grouped["test"] == 40 * 4 * 2 and released["test"] == 40 * 2
 
 
 def test_sensors_and_units_learned_from_and_tested():
@@ -162,7 +162,7 @@ def test_mistakes_are_refused():
         score_tasks(planted(lambda rows: np.full((len(rows), 3), np.nan)), WORLD, ["material"])
 
 
-# Real pictures and a real, untrained encoder.
+# Real images and a real, untrained encoder.
 
 
 @pytest.fixture(scope="module")
@@ -172,19 +172,17 @@ def touches(tmp_path_factory) -> Path:
     )
 
 
-def test_nothing_is_encoded_twice(passes, encoder, pictures, tmp_path):
-    first = score_tasks(encoder, pictures, ["material", "object"], cache=tmp_path, seeds=1)
+def test_nothing_is_encoded_twice(passes, encoder, images, tmp_path):
+    first = score_tasks(encoder, images, ["material", "object"], cache=tmp_path, seeds=1)
     # one pass for both tasks: they take the same rows
     assert passes == [32]
-    again = score_tasks(encoder, pictures, ["material", "object"], cache=tmp_path, seeds=1)
+    again = score_tasks(encoder, images, ["material", "object"], cache=tmp_path, seeds=1)
     assert passes == [32] and first == again
-    score_tasks(encoder, pictures, ["material", "force"], cache=tmp_path, seeds=1, frames=1)
-    new = np.setdiff1d(
-        select(pictures, TASKS["force"]).rows, select(pictures, TASKS["material"]).rows
-    )
+    score_tasks(encoder, images, ["material", "force"], cache=tmp_path, seeds=1, frames=1)
+    new = np.setdiff1d(select(images, TASKS["force"]).rows, select(images, TASKS["material"]).rows)
     assert passes == [32, len(new)]  # what is known is not read again
     assert len(list(tmp_path.iterdir())) == 1
-    score_tasks(encoder, pictures, ["force"], cache=tmp_path, seeds=1)
+    score_tasks(encoder, images, ["force"], cache=tmp_path, seeds=1)
     # clips are something else
     assert len(passes) == 3 and len(list(tmp_path.iterdir())) == 2
 
@@ -193,7 +191,7 @@ def test_nothing_is_encoded_twice(passes, encoder, pictures, tmp_path):
 
 
 def paint(root: Path) -> None:
-    """Give every picture under `root` bytes of its own, so that features differ."""
+    """Give every image under `root` bytes of its own, so that features differ."""
     rng = np.random.default_rng(0)
     for path in sorted(root.rglob("*.*g")):
         cv2.imwrite(str(path), rng.integers(0, 255, (16, 16, 3), np.uint8))
@@ -282,21 +280,19 @@ def test_a_public_benchmark_is_one_call(name, trees, tiny_run, tmp_path):
     record = json.loads(out.read_text())
     printed = probe_table(report["results"], report["paper"])
     assert name in printed and "raw pixels" in printed and "paper" in printed
-    published = {
-        one["features"]: one for one in record["results"] if one["protocol"] == "published"
-    }
-    assert {(one["train"], one["test"]) for one in published.values()} == {SIZES[name]}
-    assert len(published) == 3  # the run, a random encoder, raw pixels
-    assert {one["protocol"] for one in record["results"]} == {"published", "honest"}
+    released = {one["features"]: one for one in record["results"] if one["protocol"] == "released"}
+    assert {(one["train"], one["test"]) for one in released.values()} == {SIZES[name]}
+    assert len(released) == 3  # the run, a random encoder, raw pixels
+    assert {one["protocol"] for one in record["results"]} == {"released", "grouped"}
     assert record["manifest"] == manifests.read(data).content_hash
     assert record["runs"][str(tiny_run)]["model"]["image_size"] == 28
 
 
-def test_tasks_of_models_files_and_controls(pictures, tiny_run, tmp_path):
+def test_tasks_of_models_files_and_controls(images, tiny_run, tmp_path):
     out = tmp_path / "result.json"
-    data = pictures.files[0]
+    data = images.files[0]
     np.savez(
-        tmp_path / "f.npz", features=noise(np.arange(len(pictures))), rows=np.arange(len(pictures))
+        tmp_path / "f.npz", features=noise(np.arange(len(images))), rows=np.arange(len(images))
     )
     options: dict[str, Any] = {
         "features": [tmp_path / "f.npz"],
@@ -308,7 +304,7 @@ def test_tasks_of_models_files_and_controls(pictures, tiny_run, tmp_path):
         [data],
         ("material", "force"),
         seeds=1,
-        protocol="published",
+        protocol="released",
         out=out,
         log=str,
         **options,
@@ -318,11 +314,11 @@ def test_tasks_of_models_files_and_controls(pictures, tiny_run, tmp_path):
     assert {one["head"] for one in results} == {"linear", "knn"}
     names = [str(tiny_run), "random encoder", str(tmp_path / "f.npz"), "raw pixels"]
     assert list(dict.fromkeys(one["features"] for one in results)) == names
-    assert {one["protocol"] for one in results} == {"honest", "published"}
+    assert {one["protocol"] for one in results} == {"grouped", "released"}
     assert " N" in probe_table(report["results"], report["paper"])
     for word, change in (
         ("--order", {"order": "shuffled"}),
-        ("--join", {"join": "sum"}),
+        ("--aggregation", {"aggregation": "sum"}),
         ("probe", {"models": []}),
     ):
         with pytest.raises(UserError, match=word):

@@ -88,7 +88,7 @@ def test_scores_are_means_over_clips(tmp_path, monkeypatch, background):
         assert each[0]["untouched reconstruction"] == pytest.approx(hidden.mean(), rel=1e-4)
 
 
-# Pictures
+# Images
 
 CONFIG = tiny_config(1)
 NET = compiled(CONFIG.model).net

@@ -25,7 +25,7 @@ def rows(kind: str = "apart", **changes) -> RowRoles:
 def test_no_group_is_ever_on_two_sides(kind, seed):
     roles = rows(kind)
     tested = []
-    for cut in seeded_splits(roles, seed, "honest"):
+    for cut in seeded_splits(roles, seed, "grouped"):
         sides = [set(roles.groups[part]) for part in cut]
         assert (
             all(sides)
@@ -40,21 +40,21 @@ def test_no_group_is_ever_on_two_sides(kind, seed):
 
 def test_a_split_that_parts_the_groups_is_kept():
     roles = rows()
-    (cut,) = seeded_splits(roles, 0, "honest")
+    (cut,) = seeded_splits(roles, 0, "grouped")
     assert split_scheme(roles)[0] == "split"
     np.testing.assert_array_equal(cut.test, np.flatnonzero(roles.test))
     assert sorted([*cut.fit, *cut.val]) == np.flatnonzero(~roles.test).tolist()
     assert len(cut.val) == len(np.flatnonzero(~roles.test)) // FOLDS
 
 
-@pytest.mark.parametrize("protocol", ["honest", "published"])
+@pytest.mark.parametrize("protocol", ["grouped", "released"])
 def test_a_sensor_of_test_alone_is_folded_within_test(protocol):
     """A sensor that is in split test alone, fitted on and tested on: its number has folds, as its
     class has.
     """
     roles = rows()
     roles = roles._replace(
-        y=np.linspace(0, 1, N), measured=True, may_fit=roles.test, may_test=roles.test
+        y=np.linspace(0, 1, N), regression=True, may_fit=roles.test, may_test=roles.test
     )
     scheme, used, _ = split_scheme(roles)
     assert scheme == "folds"
@@ -68,28 +68,28 @@ def test_a_sensor_of_test_alone_is_folded_within_test(protocol):
 def test_every_class_is_learned_in_every_fold():
     roles = rows("shared")
     for seed in range(5):
-        for cut in seeded_splits(roles, seed, "honest"):
+        for cut in seeded_splits(roles, seed, "grouped"):
             assert set(roles.y[cut.fit]) == set(roles.y[cut.test]) == {0, 1, 2}
 
 
 def test_seeds_deal_anew_and_equal_seeds_equally():
     roles = rows()
-    first, again, other = (seeded_splits(roles, seed, "honest")[0].val for seed in (0, 0, 1))
+    first, again, other = (seeded_splits(roles, seed, "grouped")[0].val for seed in (0, 0, 1))
     np.testing.assert_array_equal(first, again)
     assert set(first) != set(other)
 
 
 @pytest.mark.parametrize("kind", ["apart", "shared"])
-def test_published_keeps_the_manifests_split_whatever_it_shares(kind):
+def test_released_keeps_the_manifests_split_whatever_it_shares(kind):
     roles = rows(kind)
-    (cut,) = seeded_splits(roles, 3, "published")
+    (cut,) = seeded_splits(roles, 3, "released")
     np.testing.assert_array_equal(cut.fit, np.flatnonzero(~roles.test))
     np.testing.assert_array_equal(cut.test, np.flatnonzero(roles.test))
     assert not len(cut.val)
 
 
 @pytest.mark.parametrize("kind", ["apart", "shared", "new"])
-@pytest.mark.parametrize("protocol", ["honest", "published"])
+@pytest.mark.parametrize("protocol", ["grouped", "released"])
 def test_sensors_and_units_teach_and_are_tested_apart(kind, protocol):
     finger = np.arange(N) // 2 % 2 == 0
     roles = rows(kind, may_fit=finger, may_test=~finger)

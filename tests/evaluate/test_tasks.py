@@ -58,7 +58,7 @@ def test_stills_and_clips_of_a_dynamic_task_take_the_same_rows(name):
     assert set(FRAME[longer.rows[:, 0]]) == {4}
 
 
-def test_slip_is_a_share_above_a_half_or_a_mark():
+def test_slip_is_a_fraction_above_a_half_or_a_mark():
     selected = select(WORLD, TASKS["slip"])
     np.testing.assert_array_equal(
         selected.labels == "yes", np.array(cells(selected, "label.slip")) > 0.5

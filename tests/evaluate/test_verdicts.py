@@ -79,12 +79,12 @@ def test_an_untrained_encoder_that_is_better_is_named():
 
 def test_tasks_are_compared_with_the_best_head_of_a_control_on_the_same_task():
     runs = {
-        ("ours", "slip", "linear", "honest"): scored(0.8),
-        (RAW, "slip", "linear", "honest"): scored(0.4),
-        (RAW, "slip", "knn", "honest"): scored(0.7),
-        (RAW, "slip", "knn", "published"): scored(0.99),
-        (RANDOM, "material", "knn", "honest"): scored(0.9),
-        ("ours", "material", "knn", "published"): scored(0.9),
+        ("ours", "slip", "linear", "grouped"): scored(0.8),
+        (RAW, "slip", "linear", "grouped"): scored(0.4),
+        (RAW, "slip", "knn", "grouped"): scored(0.7),
+        (RAW, "slip", "knn", "released"): scored(0.99),
+        (RANDOM, "material", "knn", "grouped"): scored(0.9),
+        ("ours", "material", "knn", "released"): scored(0.9),
     }
     (line,) = task_verdicts(runs, {"slip": False, "material": False})
     assert line.startswith(
@@ -99,6 +99,6 @@ def test_a_regression_is_compared_by_r2():
     runs = {}
     for name, noise in (("ours", 0.3), (RAW, 0.8)):
         sums = regression_sums(noise * rng.normal(size=100), truth, groups)
-        runs[name, "force", "linear", "honest"] = [sums]
+        runs[name, "force", "linear", "grouped"] = [sums]
     (line,) = task_verdicts(runs, {"force": True})
     assert "of R2 above the best control, raw pixels (linear) (0." in line

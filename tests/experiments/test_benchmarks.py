@@ -151,7 +151,8 @@ def test_what_does_not_run_here_is_a_row_with_a_note():
         work, tried, rounds=2, with_errors=False, peak_size=64
     )
     assert (
-        base.gflops == pytest.approx(base.operations / base.seconds / 1e9) and base.peak_share > 0
+        base.gflops == pytest.approx(base.operations / base.seconds / 1e9)
+        and base.peak_fraction > 0
     )
     assert remat.peak_bytes > remat.temp_bytes > 0 and remat.ratio > 0
     assert absent.note and np.isnan(absent.ratio) and absent.variant == "seven bits"

@@ -33,12 +33,12 @@ def test_files_are_probed_by_both_protocols_and_the_page_is_the_users_own(
     options = run.Options(encoders=(f"mine={encoder}",), data=(data,), label="hardness")
     assert run.run(options) == 0, capsys.readouterr().err
     records = read_records(out)
-    assert {record.get("protocol") for record in records.values()} == {"honest", "published", None}
+    assert {record.get("protocol") for record in records.values()} == {"grouped", "released", None}
     text = out.with_suffix(".md").read_text()
     assert not (tmp_path / "experiments").exists()
     assert (
-        "linear, honest, %" in text
-        and "kNN, published, %" in text
+        "linear, grouped, %" in text
+        and "kNN, released, %" in text
         and "| mine | 1 | 28 x 28 |" in text
     )
     refused("add DATA", run.run, run.Options(encoders=("mine=x",), out=out))

@@ -95,7 +95,7 @@ def test_two_fingers_balance_gravity_and_its_moment(seed):
     """Forces and moments by vectors: a finger stands at +R n, with the gel, and one at -R n; both
     bear f k and f e.
     """
-    setup = setup_of(seed, share=0.5, relax=0.0)
+    setup = setup_of(seed, fraction=0.5, relax=0.0)
     tilt = 0.8
     slope = 0.4
     mass = 70.0
@@ -197,7 +197,7 @@ def test_mistakes_are_one_sentence(script, words, named):
     assert logged.status == 2 and named in logged.err and len(logged.err.strip().splitlines()) == 1
 
 
-def test_what_was_recorded_is_not_mixed_with_new_pictures(script, tmp_path):
+def test_what_was_recorded_is_not_mixed_with_new_images(script, tmp_path):
     (tmp_path / "manifest.parquet").write_bytes(b"of an earlier recording")
     logged = script(pour, "--record", tmp_path, "--demos", 2)
     assert logged.status == 2 and len(list(tmp_path.iterdir())) == 1

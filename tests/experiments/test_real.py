@@ -70,7 +70,7 @@ def test_features_that_name_the_object_are_right_and_noise_is_not(data, head):
         scores.object_score(x, data, scores.HEADS[head])
         for x in (planted(data, 0.1), planted(data, 50.0))
     )
-    assert clear.share == 1.0 and noise.share < 0.6
+    assert clear.fraction == 1.0 and noise.fraction < 0.6
     assert len(clear.groups) == len(np.unique(data.recording[data.split == "test"]))
     mean, low, _ = clear.minus(noise)
     assert mean > 0.4 and low > 0.1
@@ -83,23 +83,23 @@ def test_the_other_finger_is_scored_on_the_camera_that_the_head_never_saw(data):
     """
     x = planted(data, 0.01)
     x[data.finger == "cam2"] = np.roll(x[data.finger == "cam2"], 1, axis=1)
-    assert scores.object_score(x, data).share > 0.4
-    assert scores.other_finger_score(x, data).share == 0.0
+    assert scores.object_score(x, data).fraction > 0.4
+    assert scores.other_finger_score(x, data).fraction == 0.0
 
 
 def test_slip_is_scored_on_objects_that_the_head_never_saw(data):
     """A feature that is the object's number says nothing of an unseen object."""
-    assert scores.slip_score(planted(data, 0.01), data).share < 0.7
+    assert scores.slip_score(planted(data, 0.01), data).fraction < 0.7
     slipping = data.slip[:, None] + 0.01 * RNG.standard_normal((len(data.slip), 3))
-    assert scores.slip_score(slipping.astype(np.float32), data).share == 1.0
+    assert scores.slip_score(slipping.astype(np.float32), data).fraction == 1.0
 
 
-def test_the_untouched_gel_is_the_units_picture_a_median_or_the_first_frame(tmp_path):
+def test_the_untouched_gel_is_the_units_image_a_median_or_the_first_frame(tmp_path):
     rng = np.random.default_rng(0)
     names = ("gel", *(f"{take}{number}" for take in "ab" for number in range(3)))
-    pictures = {name: rng.integers(0, 256, (48, 64, 3), np.uint8) for name in names}
-    for name, picture in pictures.items():
-        cv2.imwrite(str(tmp_path / f"{name}.png"), picture[..., ::-1])
+    images = {name: rng.integers(0, 256, (48, 64, 3), np.uint8) for name in names}
+    for name, image in images.items():
+        cv2.imwrite(str(tmp_path / f"{name}.png"), image[..., ::-1])
     order = ("b1", "a0", "b2", "b0", "a1", "a2")
     given = columns(
         6, path=[f"{name}.png" for name in order], frame_index=[int(name[1]) for name in order]
@@ -117,13 +117,13 @@ def test_the_untouched_gel_is_the_units_picture_a_median_or_the_first_frame(tmp_
     }
     path = tmp_path / "m.parquet"
     manifests.write(manifests.from_columns(given, path), path)
-    middle = np.partition(np.stack([pictures[name] for name in order]), 2, axis=0)[2]
+    middle = np.partition(np.stack([images[name] for name in order]), 2, axis=0)[2]
     for word, wanted in (
-        ("rule", (pictures["gel"], middle)),
+        ("rule", (images["gel"], middle)),
         ("median", (middle, middle)),
-        ("first frame", (pictures["a0"], pictures["b0"])),
+        ("first frame", (images["a0"], images["b0"])),
     ):
         data = recordings.read(path, word)
         for name, take, (frame, gel) in zip(order, data.recording, data.pairs(), strict=True):
-            np.testing.assert_array_equal(frame, pictures[name])
+            np.testing.assert_array_equal(frame, images[name])
             np.testing.assert_array_equal(gel, wanted["ab".index(take)])

@@ -85,9 +85,9 @@ def test_an_export_is_made_once_and_again_when_anything_that_decides_it_changes(
     tmp_path, monkeypatch
 ):
     made = []
-    honest = exports.export_with
+    grouped = exports.export_with
     monkeypatch.setattr(
-        exports, "export_with", lambda *given, **more: (made.append(0), honest(*given, **more))[1]
+        exports, "export_with", lambda *given, **more: (made.append(0), grouped(*given, **more))[1]
     )
 
     def features(path):
@@ -132,12 +132,12 @@ def test_exports_of_the_package_and_of_a_folder_that_cannot_be_written_are_in_th
 
 
 def test_an_export_that_differs_is_never_used_and_not_tried_again(tmp_path, monkeypatch):
-    honest = engines.touch_graph
+    grouped = engines.touch_graph
     tried = []
 
     def other(params, *rest):
         tried.append(0)
-        return honest(jax.tree.map(lambda x: x * np.float32(1.001), params), *rest)
+        return grouped(jax.tree.map(lambda x: x * np.float32(1.001), params), *rest)
 
     monkeypatch.setattr(engines, "touch_graph", other)
     path = weights(tmp_path / "w.safetensors")

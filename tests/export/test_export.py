@@ -150,8 +150,8 @@ def test_an_artefact_that_differs_from_the_live_model_is_not_written(
     encoder, tmp_path, monkeypatch
 ):
     other = random_encoder(encoder.config, seed=5)
-    honest = exports._artefact
-    monkeypatch.setattr(exports, "_artefact", lambda _, *rest: honest(other, *rest))
+    grouped = exports._artefact
+    monkeypatch.setattr(exports, "_artefact", lambda _, *rest: grouped(other, *rest))
     with pytest.raises(UserError, match="differs from the live model"):
         export(encoder, tmp_path / "m.bin", platforms=("cpu",))
     assert list(tmp_path.iterdir()) == []

@@ -11,7 +11,7 @@ import pytest
 import anytouch_jax as at
 
 # (press, sensor): deepest and mean depth in contact in mm, mean shear in contact along x and y in
-# mm where the picture moves to the right and down by 3 % of its width, force in N
+# mm where the image moves to the right and down by 3 % of its width, force in N
 GOLDEN: dict[tuple[str, str], tuple[float, ...]] = {
     ("dots", "digit"): (0.5089, 0.1598, 0.0019, 0.0056, -0.0045, 0.0090, 2.0992),
     ("dots", "gelsight_mini"): (1.0857, 0.5877, 0.0103, 0.0035, -0.0096, 0.0242, 5.9254),

@@ -190,7 +190,7 @@ def test_what_cannot_be_measured_is_one_sentence(encoder, tiny_run):
 def faulty(kind: str) -> tuple[np.ndarray, np.ndarray | None]:
     """Return a frame of a real look of the GelSight Mini with a fault, and its background."""
     real = np.ascontiguousarray(
-        np.repeat(np.repeat(fields.known_gels("gelsight_mini")[0], 4, 0), 4, 1)
+        np.repeat(np.repeat(fields.known_backgrounds("gelsight_mini")[0], 4, 0), 4, 1)
     )
     grey = np.repeat(real.mean(2, keepdims=True).astype(np.uint8), 3, 2)
     return {
@@ -292,39 +292,38 @@ def test_the_surface_is_a_mesh_in_mm(tmp_path):
     faces = np.frombuffer(body[192 * 15 :], [("count", "u1"), ("corners", "<i4", 3)])
     corner, second, third = np.moveaxis(at[faces["corners"]], 1, 0)
     assert (np.cross(second - corner, third - corner)[:, 2] > 0).all()
-    picture = fields.overlay(gel(64, 48), one)
+    image = fields.overlay(gel(64, 48), one)
     assert (
-        picture.shape == (64, 48, 3)
-        and np.abs(picture[:28].astype(int) - gel(64, 48)[:28]).mean() > 20
+        image.shape == (64, 48, 3) and np.abs(image[:28].astype(int) - gel(64, 48)[:28]).mean() > 20
     )
 
 
 def test_shear_is_the_motion_of_dots_in_mm(encoder):
     y, x = np.mgrid[:120, :160]
 
-    def picture(by, sides=1):
+    def image(by, sides=1):
         ink = np.hypot((x - by) % 16 - 8, y % 16 - 8) < 3
         return np.clip(
             np.where(ink, 30, 120 + x / 4)[..., None] + (0, 15 * sides, -20 * sides), 0, 255
         ).astype(np.uint8)
 
-    moved = encoder.measure(np.stack([picture(0), picture(3)]), picture(0), "tacto", width_mm=16.0)
+    moved = encoder.measure(np.stack([image(0), image(3)]), image(0), "tacto", width_mm=16.0)
     assert np.abs(np.median(moved.shear, (1, 2)) - [[0, 0], [0.3, 0]]).max() < 0.02
     assert (
         moved.shear.shape == (*moved.depth.shape, 2) and moved.shear_std.shape == moved.depth.shape
     )
     assert np.median(moved.shear_std) < 0.05
-    shares = encoder.measure(picture(3), picture(0), "tacto").shear
-    np.testing.assert_allclose(16 * shares[0], moved.shear[1], atol=1e-5)
-    grey = encoder.measure(picture(3, 0), picture(0), "tacto", width_mm=16.0, log=lambda _: None)
+    fractions = encoder.measure(image(3), image(0), "tacto").shear
+    np.testing.assert_allclose(16 * fractions[0], moved.shear[1], atol=1e-5)
+    grey = encoder.measure(image(3, 0), image(0), "tacto", width_mm=16.0, log=lambda _: None)
     assert grey.faults and np.median(grey.shear_std) > 0.5
 
     scale = fields.Scale(16.0, 100.0, 0.0, None, dict.fromkeys(fields._NAMES, 1.0))
-    measure = fields.Measure(scale, "mine", picture(0), lambda _: None, 0, "none")
+    measure = fields.Measure(scale, "mine", image(0), lambda _: None, 0, "none")
     # a quarter of 16 x 12 mm is in contact: 48 mm2
-    dragged = measure(output(), [picture(3)])
+    dragged = measure(output(), [image(3)])
     wanted = fields.DRAG * 0.1 * 0.3 * np.sqrt(48)
     np.testing.assert_allclose(dragged.force[0, :2], [wanted, 0], atol=0.05 * wanted)
     assert dragged.force[0, 2] == pytest.approx(0.02 * 100 * 0.256, rel=1e-4)
-    free = measure(output(contact=np.full((1, SIDE, SIDE), -9.0)), [picture(3)])
+    free = measure(output(contact=np.full((1, SIDE, SIDE), -9.0)), [image(3)])
     assert not free.force[0, :2].any(), "a gel that moved in its mount is not dragged"

@@ -20,7 +20,7 @@ from anytouch_jax.encoder.linear_head import LinearHead, save_head
 
 @dataclass(frozen=True)
 class Things:
-    """Whole inputs: a manifest, a folder with one picture, a run, its weights, features of the
+    """Whole inputs: a manifest, a folder with one image, a run, its weights, features of the
     manifest and a head.
     """
 

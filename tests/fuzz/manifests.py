@@ -275,8 +275,8 @@ def make(rng, folder: Path, things) -> Case:
         file = folder / "m.parquet"
         name, wrong = parquet(rng, things, file)
         wrong_files = wrong
-    for picture in things.manifest.parent.glob("*.png"):
-        shutil.copyfile(picture, folder / picture.name)
+    for image in things.manifest.parent.glob("*.png"):
+        shutil.copyfile(image, folder / image.name)
     commands = {
         "info": ("info", file),
         "verify": ("data", "verify", "--no-decode", file),

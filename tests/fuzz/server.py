@@ -163,9 +163,9 @@ def odd_bytes(rng):
 
 def make(rng, folder: Path, things) -> Case:
     name, answer = pick(rng, (odd_shape, odd_shape, odd_status, odd_wait, odd_bytes))(rng)
-    for picture in ("t", "p"):
+    for image in ("t", "p"):
         np.save(
-            folder / f"{picture}.npy",
+            folder / f"{image}.npy",
             np.random.default_rng(0).integers(0, 255, (32, 32, 3), np.uint8),
         )
     file = folder / "m.csv"

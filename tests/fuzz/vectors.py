@@ -35,7 +35,7 @@ def searched(x: Any, things: Any) -> Any:
 
 
 def ranked(x: Any, things: Any) -> Any:
-    """The share of rows that find themselves, in galleries of all rows."""
+    """The fraction of rows that find themselves, in galleries of all rows."""
     rows = np.arange(len(x))
     items = np.stack([np.concatenate([[row], np.delete(rows, row)]) for row in rows])[None]
     return score_galleries(x, x, Galleries(rows, items, (0.0, 0.0), 0))[0]

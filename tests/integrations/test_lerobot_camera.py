@@ -1,4 +1,4 @@
-"""The camera of LeRobot: found by LeRobot's rules, oriented and subtracted pictures, features."""
+"""The camera of LeRobot: found by LeRobot's rules, oriented and subtracted images, features."""
 
 import importlib
 import sys
@@ -7,9 +7,9 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
-from films import write_film
 from measuring import gel, measuring_weights
 from places import ROOT
+from videos import write_video
 
 from anytouch_jax import load_encoder
 from tests.support import lerobot_interface
@@ -32,16 +32,16 @@ def plugin(monkeypatch):
 
 
 @pytest.fixture
-def film(monkeypatch):
-    """Four pictures of 40 x 60: an even gel, then a press that grows in the upper left corner."""
+def video(monkeypatch):
+    """Four images of 40 x 60: an even gel, then a press that grows in the upper left corner."""
     frames = [np.full((40, 60, 3), 90, np.uint8) for _ in range(4)]
     for i, frame in enumerate(frames):
         frame[:10, :10] += 20 * i
-    monkeypatch.setattr(lerobot_interface.FilmCamera, "frames", frames)
+    monkeypatch.setattr(lerobot_interface.VideoCamera, "frames", frames)
     return frames
 
 
-def test_lerobot_finds_the_camera_and_its_pictures_are_oriented_and_subtracted(plugin, film):
+def test_lerobot_finds_the_camera_and_its_images_are_oriented_and_subtracted(plugin, video):
     kind = lerobot_interface.CameraConfig.known["anytouch"]
     config = kind(index_or_path=0, width=40, height=60, rotate=90)
     camera = lerobot_interface.device_class(config)(config)
@@ -62,7 +62,7 @@ def test_lerobot_finds_the_camera_and_its_pictures_are_oriented_and_subtracted(p
         with pytest.raises(TimeoutError):
             camera.async_read(1)
     assert not camera.is_connected
-    assert camera.find_cameras() == [{"name": "film", "type": "anytouch", "id": 0}]
+    assert camera.find_cameras() == [{"name": "video", "type": "anytouch", "id": 0}]
 
 
 @contextmanager
@@ -75,7 +75,7 @@ def camera_open(camera):
         camera.disconnect()
 
 
-def test_features_are_those_of_the_encoder(plugin, film, tmp_path):
+def test_features_are_those_of_the_encoder(plugin, video, tmp_path):
     file = mae(tmp_path / "mae")
     camera = plugin.AnyTouchCamera(
         plugin.AnyTouchCameraConfig(index_or_path=0, encoder=str(file), subtract=False)
@@ -83,30 +83,30 @@ def test_features_are_those_of_the_encoder(plugin, film, tmp_path):
     with camera_open(camera):
         frame = camera.read()
         encoder = load_encoder(file)
-        assert np.array_equal(frame, film[1])  # not subtracted
+        assert np.array_equal(frame, video[1])  # not subtracted
         np.testing.assert_array_equal(
-            camera.features(), encoder.encode_touch(encoder.preprocess(film[1]))[0]
+            camera.features(), encoder.encode_touch(encoder.preprocess(video[1]))[0]
         )
 
 
-def test_a_film_never_ends_and_its_depth_is_a_grey_picture(plugin, tmp_path):
-    """LeRobot's own camera reads a film as fast as it can, and then its thread is over."""
-    path = tmp_path / "film.avi"
+def test_a_video_never_ends_and_its_depth_is_a_grey_image(plugin, tmp_path):
+    """LeRobot's own camera reads a video as fast as it can, and then its thread is over."""
+    path = tmp_path / "video.avi"
     weights = measuring_weights(tmp_path / "weights.safetensors")
     frames = [gel() for _ in range(4)]
-    for number, picture in enumerate(frames):
-        picture[10:30, 10 : 20 + 8 * number] += 60
-    write_film(path, (picture[..., ::-1] for picture in frames), 100)
+    for number, image in enumerate(frames):
+        image[10:30, 10 : 20 + 8 * number] += 60
+    write_video(path, (image[..., ::-1] for image in frames), 100)
     settings = {"index_or_path": path, "encoder": str(weights), "sensor": "tacto", "width_mm": 12.0}
     camera = plugin.AnyTouchCamera(
         plugin.AnyTouchCameraConfig(**settings, depth=True, white_mm=0.1, rotate=90)
     )
     with camera_open(camera):
         assert (camera.width, camera.height, camera.fps) == (48, 64, 100)
-        pictures = [camera.read() for _ in range(6)] + [camera.async_read(), camera.read_latest()]
-        assert all(one.shape == (64, 48, 3) and one.dtype == np.uint8 for one in pictures)
-        assert len({one.tobytes() for one in pictures}) > 2 and np.ptp(pictures[0]) > 20
-        assert (pictures[0] == pictures[0][..., :1]).all() and camera.features().shape == (12,)
+        images = [camera.read() for _ in range(6)] + [camera.async_read(), camera.read_latest()]
+        assert all(one.shape == (64, 48, 3) and one.dtype == np.uint8 for one in images)
+        assert len({one.tobytes() for one in images}) > 2 and np.ptp(images[0]) > 20
+        assert (images[0] == images[0][..., :1]).all() and camera.features().shape == (12,)
         measured = camera.fields()
         assert measured.width_mm == 12 and measured.force.shape == (1, 3) and not measured.faults
     assert not camera.is_connected

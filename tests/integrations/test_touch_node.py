@@ -7,9 +7,9 @@ from types import ModuleType, SimpleNamespace
 import cv2
 import numpy as np
 import pytest
-from films import write_film
 from measuring import measuring_weights
 from places import ROOT
+from videos import write_video
 
 
 class Ros:
@@ -128,7 +128,7 @@ def test_what_every_frame_publishes_until_ros_ends(
     press = gel.copy()
     press[10:30, 10:30] += 90
     cv2.imwrite("gel.png", gel)
-    write_film("7.avi", (gel, gel, press, press), 30)
+    write_video("7.avi", (gel, gel, press, press), 30)
     (tmp_path / "7.avi").rename("7")  # a number, as camera:=0 is for ROS
     model = measuring_weights(tmp_path / "weights.safetensors") if measures else tiny_run
     given = {

@@ -18,8 +18,7 @@ NAMES = (
     "DATA",
     "SCENES",
     "DEMO",
-    "DEMO_STEPS",
-    "DEMO_STEPS1",
+    "DEMO_MINUTES",
     "RUN",
     "INIT",
     "PRESET",
@@ -137,40 +136,9 @@ def test_without_data_touches_are_simulated(tmp_path: Path) -> None:
     assert len(planned("probe", f"SCENES={scenes}")) == len(planned("probe", "DATA=a.csv")) == 1
 
 
-def test_the_demo_simulates_trains_both_stages_and_reports() -> None:
-    commands = planned("demo", "DEMO=d")
-    simulate, contact, stage1, stage2, report = map(parsed, commands)
-    assert simulate.out == Path("d/scenes") and contact.out == Path("d/scenes/contact.parquet")
-    # marked once only
-    assert "test -e d/scenes/contact.parquet || " in make("-n", "demo", "DEMO=d").stdout
-    for stage, (options, config) in enumerate((stage1, stage2), 1):
-        assert options.stage == config.stage == stage and options.data == (contact.out,)
-        assert config.data.contact_only and config.data.background == "subtract"
-    assert stage2.options.init == stage1.options.run == report.stage1 == Path("d/stage1")
-    assert report.stage2 == stage2.options.run and report.data == contact.out
-
-
-def test_a_longer_demo_continues_from_the_scenes_and_stage_1_of_the_plain_one() -> None:
-    plain = planned("demo", "DEMO=d")
-    longer = planned("demo", "DEMO=d", "DEMO_STEPS=600")
-    longest = planned("demo", "DEMO=d", "DEMO_STEPS1=3000", "DEMO_STEPS=600")
-    assert plain[:-2] == longer[:-2] and plain[:-3] == longest[:-3]
-    options, config = parsed(longer[-2])
-    assert (options.run, options.init, config.run.steps) == (
-        Path("d/stage2-600"),
-        Path("d/stage1"),
-        600,
-    )
-    assert (parsed(longer[-1]).stage2, parsed(longer[-1]).out) == (
-        Path("d/stage2-600"),
-        Path("d/report-600"),
-    )
-    options, config = parsed(longest[-3])
-    assert (options.run, config.run.steps) == (Path("d/stage1-3000"), 3000)
-    options = parsed(longest[-2]).options
-    report = parsed(longest[-1])
-    assert (options.run, options.init) == (Path("d/stage2-3000-600"), Path("d/stage1-3000"))
-    assert (report.stage1, report.out) == (Path("d/stage1-3000"), Path("d/report-3000-600"))
+def test_the_demo_is_one_script() -> None:
+    done = make("-n", "demo", "DEMO=d", "DEMO_MINUTES=3")
+    assert done.stdout.endswith("-m experiments.demo.run --out d --minutes 3\n")
 
 
 def test_an_old_python_is_one_sentence(tmp_path: Path) -> None:
@@ -218,7 +186,7 @@ NOT_RUN = {
     "setup": "CI begins with it, in a fresh clone",
     "test": "it is running",
     "test-all": "it is running",
-    "demo": "it trains for minutes, and the tests above read its commands",
+    "demo": "it trains for minutes, and tests/experiments/test_demo.py runs its parts",
     "bench": "it measures for minutes, and tests/experiments/test_benchmarks.py runs its parts",
     "compare": "it measures encoders of full size, and test_compare.py runs a small one",
     "docs": "it installs packages from the network",

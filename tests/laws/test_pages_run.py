@@ -22,12 +22,12 @@ import numpy as np
 import pytest
 from blank_recorder import BlankRecorder
 from chat_server import KEY, serve
-from gel_pictures import press
+from gel_images import press
 from places import ROOT
 from reader_world import fill_ycb
 from runs import SIZES
 from tiny_models import tiny_config
-from touch_world import make_touches, picture, tint
+from touch_world import make_touches, render, tint
 
 import anytouch_jax as at
 from anytouch_jax.cli.app import main
@@ -55,7 +55,7 @@ HERE = {
     "verify FILE": "verify manifest.parquet",
     "only OUT": "only free.parquet",
     "tacquad.parquet": "tacquad.parquet --yes",
-    "observation.images.tactile ": f"{test_lerobot.FILM} ",
+    "observation.images.tactile ": f"{test_lerobot.VIDEO} ",
     "--out report": "--out report --touches 40",
     " ...": "",
     "info FILE": "info runs/stage1",
@@ -71,7 +71,7 @@ FREE = re.compile(
     r"|(?<=^frame to features )[\d. ]+$|\d+(?= frames embedded)"
 )
 NUMBER = re.compile(r"(?<![\w.])[-+]?\d[\d,]*(?:\.\d+)?")
-STAGE1 = {name: value for name, value in SIZES.items() if "clip-share" not in name} | {
+STAGE1 = {name: value for name, value in SIZES.items() if "clip-fraction" not in name} | {
     "batch": 8,
     "data.threads": 1,
 }
@@ -128,7 +128,7 @@ def make_recordings(file: Path) -> None:
             split = "train" if number < 7 else "val" if number < 9 else "test"
             for sensor in ("digit", "gelsight"):
                 for frame in range(4):
-                    pixels = picture(
+                    pixels = render(
                         texture, place, 2 + 2 * frame, tint(("digit", "gelsight"), sensor), 32
                     )
                     path = f"{thing}{number}_{sensor}_{frame}.png"
@@ -264,7 +264,7 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
         )
         for place in (f"mine/{thing}/pour_{i}" for thing in ("mug", "sponge") for i in (1, 2, 3)):
             Path(place).mkdir(parents=True)
-            # no two pictures are equal
+            # no two images are equal
             for i in range(4):
                 pixels = press(20 * i % 120) // 2 + rng.integers(0, 9, (48, 48, 3), np.uint8)
                 cv2.imwrite(f"{place}/{i:03d}.png", pixels)
@@ -279,12 +279,12 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
             for i in range(24):
                 shutil.copy(f"cup{i // 4}_{sensor}_{i % 4}.png", f"{folder_of}/{i:03d}.png")
         shutil.copy("digit.png", "gel.png")
-        film = cv2.VideoWriter(
+        video = cv2.VideoWriter(
             "press.mp4", cv2.VideoWriter.fourcc(*"mp4v"), 25, cv2.imread("gel.png").shape[1::-1]
         )
         for i in range(4):
-            film.write(cv2.imread(f"cup0_digit_{i}.png"))
-        film.release()
+            video.write(cv2.imread(f"cup0_digit_{i}.png"))
+        video.release()
         shutil.copy("test0_digit_3.png", "press.png")
         make_units(Path("units"))
         golden = ROOT / "tests" / "parity" / "golden_others"

@@ -9,8 +9,8 @@ import time
 import cv2
 import numpy as np
 import pytest
-from films import write_film
 from refused import refused
+from videos import write_video
 
 from anytouch_jax.live import cameras
 from anytouch_jax.live.cameras import CameraSettings, camera_of, list_cameras, open_source
@@ -107,8 +107,8 @@ def test_cameras_are_listed_with_names_serials_sizes_and_rates(system):
         ("digit", 0),
         ("d20345", 0),
         ("gelsight mini", 2),
-        ("film.mp4", None),
-        ("films/digit", None),
+        ("video.mp4", None),
+        ("videos/digit", None),
         ("http://host/a", "http://host/a"),
         ("rtsp://host", "rtsp://host"),
         ("", None),
@@ -176,22 +176,22 @@ def test_a_camera_is_asked_and_what_it_gives_is_reported(system, monkeypatch, as
         )
 
 
-def test_an_address_is_a_camera_and_a_film_at_an_address_is_a_film(tmp_path):
-    film = tmp_path / "film.avi"
-    write_film(film, (np.full((48, 64, 3), 40 * number, np.uint8) for number in range(5)))
-    picture = cv2.imencode(".jpg", np.full((48, 64, 3), 90, np.uint8))[1].tobytes()
+def test_an_address_is_a_camera_and_a_video_at_an_address_is_a_video(tmp_path):
+    video = tmp_path / "video.avi"
+    write_video(video, (np.full((48, 64, 3), 40 * number, np.uint8) for number in range(5)))
+    image = cv2.imencode(".jpg", np.full((48, 64, 3), 90, np.uint8))[1].tobytes()
 
     class Answer(http.server.BaseHTTPRequestHandler):
         def do_GET(self):
             self.send_response(200)
-            is_film = self.path == "/film.avi"
+            is_video = self.path == "/video.avi"
             self.send_header(
-                "Content-Type", "video/avi" if is_film else "multipart/x-mixed-replace; boundary=b"
+                "Content-Type", "video/avi" if is_video else "multipart/x-mixed-replace; boundary=b"
             )
             self.end_headers()
             part = b"--b\r\nContent-Type: image/jpeg\r\n"
-            part += f"Content-Length: {len(picture)}\r\n\r\n".encode()
-            self.wfile.write(film.read_bytes() if is_film else (part + picture + b"\r\n") * 200)
+            part += f"Content-Length: {len(image)}\r\n\r\n".encode()
+            self.wfile.write(video.read_bytes() if is_video else (part + image + b"\r\n") * 200)
 
         def log_message(self, *_):
             pass
@@ -214,7 +214,7 @@ def test_an_address_is_a_camera_and_a_film_at_an_address_is_a_film(tmp_path):
 
 
 class Slow:
-    """A camera that says it gives 200 frames/s, and repeats each of its pictures."""
+    """A camera that says it gives 200 frames/s, and repeats each of its images."""
 
     def __init__(self, number: int) -> None:
         self.is_there = number == 0

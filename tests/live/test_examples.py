@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from anytouch_jax.data.background.contact import THRESHOLDS
-from anytouch_jax.data.background.estimate import UntouchedGel
+from anytouch_jax.data.background.estimate import UntouchedBackground
 from anytouch_jax.live.examples import SENSOR, ExampleCamera
 
 
@@ -13,7 +13,7 @@ def test_two_things_press_in_turn_and_nothing_between(turn):
     """Contact and its end are found, and no frame repeats the one before."""
     camera = ExampleCamera()
     begin = 5.5 * turn
-    gel = UntouchedGel(camera.frame(0.0))
+    gel = UntouchedBackground(camera.frame(0.0))
     scores = [gel.score(camera.frame(begin + at)) for at in (0.2, 1.0, 2.0, 3.5, 5.0, 5.49)]
     is_pressed = [score > THRESHOLDS[SENSOR] for score in scores]
     assert is_pressed == [False, False, True, True, True, False]

@@ -33,17 +33,17 @@ def made_unit(number: int = 0, recordings: int = 9, frames: int = 2) -> UnitFram
     """Presses at changing places, with camera noise."""
     rng = np.random.default_rng(100 + number)
     background = gel(number)
-    films = []
+    videos = []
     y, x = np.mgrid[:120, :160]
     for _ in range(recordings):
         cy, cx = rng.uniform((20, 20), (100, 140))
         dent = np.exp(-((y - cy) ** 2 + (x - cx) ** 2) / 160)[..., None] * (60, -40, 30)
-        film = [
+        video = [
             background + depth * dent + rng.normal(0, 1.5, background.shape)
             for depth in np.linspace(0.3, 1, frames)
         ]
-        films.append([np.clip(frame, 0, 255).astype(np.uint8) for frame in film])
-    return UnitFrames("digit", f"u{number}", films, background, np.ones(400), recordings * frames)
+        videos.append([np.clip(frame, 0, 255).astype(np.uint8) for frame in video])
+    return UnitFrames("digit", f"u{number}", videos, background, np.ones(400), recordings * frames)
 
 
 UNITS = [made_unit(number) for number in range(4)]
@@ -78,7 +78,7 @@ def test_a_made_fault_is_reported_by_its_check_with_advice(fault):
 
 
 def test_a_good_unit_that_looks_odd_raises_no_alarm():
-    """Too small a picture, deep touches of a soft gel, and one odd reference of three."""
+    """Too small an image, deep touches of a soft gel, and one odd reference of three."""
     assert check(UNITS[0], "focus").ok is None
     rng = np.random.default_rng(1)
     deep = []
@@ -89,11 +89,11 @@ def test_a_good_unit_that_looks_odd_raises_no_alarm():
         deep.append([np.clip(frame + press, 0, 255).astype(np.uint8) for frame in frames])
     assert check(replace(UNITS[0], recordings=deep), "one unit").ok
     own, *noise = rng.uniform(-60, 60, (4, 16, 16, 3))
-    # of the picture and its mirror image: the last is odd
-    shares = ((0.8, 0.7), (0.8, 0.7), (0.3, 0.9))
+    # of the image and its mirror image: the last is odd
+    fractions = ((0.8, 0.7), (0.8, 0.7), (0.3, 0.9))
     known = [
         a * own + b * own[:, ::-1] + 0.2 * grain
-        for (a, b), grain in zip(shares, noise, strict=True)
+        for (a, b), grain in zip(fractions, noise, strict=True)
     ]
     own, *known = (np.clip(128 + look, 0, 255).astype(np.uint8) for look in (own, *known))
     assert health.check_layout(replace(UNITS[0], background=own), known).ok
@@ -105,14 +105,18 @@ def test_a_lamp_that_is_stronger_is_no_fault_and_a_turned_or_recoloured_unit_is(
 
     One side is up to a fifth brighter in one colour.
     """
-    for number, gel_of_unit in enumerate(gels := health.known_gels(sensor)):
-        others = gels[:number] + gels[number + 1 :]
-        side = np.linspace(-1, 1, gel_of_unit.shape[1])
-        for colour, share in product(range(3), (-0.2, -0.1, 0.1, 0.2)):
-            gain = 1 + share * side[:, None] * (np.arange(3) == colour)
-            lit = np.clip(gel_of_unit * gain, 0, 255).astype(np.uint8)
+    for number, background_of_unit in enumerate(backgrounds := health.known_backgrounds(sensor)):
+        others = backgrounds[:number] + backgrounds[number + 1 :]
+        side = np.linspace(-1, 1, background_of_unit.shape[1])
+        for colour, fraction in product(range(3), (-0.2, -0.1, 0.1, 0.2)):
+            gain = 1 + fraction * side[:, None] * (np.arange(3) == colour)
+            lit = np.clip(background_of_unit * gain, 0, 255).astype(np.uint8)
             assert health.check_layout(UnitFrames(sensor, "", [[lit]]), others).ok
-        for wrong in (gel_of_unit[::-1, ::-1], gel_of_unit[::-1], gel_of_unit[..., ::-1]):
+        for wrong in (
+            background_of_unit[::-1, ::-1],
+            background_of_unit[::-1],
+            background_of_unit[..., ::-1],
+        ):
             assert (
                 health.check_layout(
                     UnitFrames(sensor, "", [[np.ascontiguousarray(wrong)]]), others

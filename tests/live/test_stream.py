@@ -8,8 +8,8 @@ import cv2
 import jax
 import numpy as np
 import pytest
-from faulty_camera import KINDS, FaultyCamera, Film
-from films import write_film
+from faulty_camera import KINDS, FaultyCamera, Video
+from videos import write_video
 
 from anytouch_jax.data.images import frames_from_video
 from anytouch_jax.data.transforms import touch_evaluation
@@ -33,7 +33,7 @@ def video(tmp_path_factory):
         np.full((32, 40, 3), (20, 30 * number, 200), np.uint8) + one
         for number, one in enumerate(noise)
     ]
-    return write_film(tmp_path_factory.mktemp("video") / "touch.avi", frames)
+    return write_video(tmp_path_factory.mktemp("video") / "touch.avi", frames)
 
 
 class Camera:
@@ -165,7 +165,7 @@ def test_a_camera_gives_its_newest_frames_and_the_old_ones_are_dropped(encoder):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_camera_that_misses_a_read_goes_on_and_then_fails(encoder, kind):
-    """The picture of another shape is a missed read.
+    """The image of another shape is a missed read.
 
     No clip spans it, and the end of a camera is never normal.
     """
@@ -201,19 +201,19 @@ def test_no_clip_spans_a_missed_read(encoder):
 
 
 @pytest.mark.parametrize("kind", ["frozen", "black", "ok"])
-def test_a_frozen_and_a_black_picture_are_reported_once(encoder, kind):
+def test_a_frozen_and_a_black_image_are_reported_once(encoder, kind):
     logged = []
     outcome = []
     found = streams.stream(
         encoder, FaultyCamera(kind, frames=60), live=True, sensor=DIGIT, log=logged.append
     )
     result = streams.collect(found, outcome.append)
-    pictures = [one.picture for one in outcome]
-    assert pictures[0] == "ok" and pictures[-1] == kind and result.missed == 0
+    images = [one.image for one in outcome]
+    assert images[0] == "ok" and images[-1] == kind and result.missed == 0
     assert sum(f"is {kind} at frame" in line for line in logged) == (kind != "ok")
     counts = {"frozen": result.frozen, "black": result.black}
-    assert counts == {name: pictures.count(name) for name in counts}
-    reused = [one.picture for one in outcome if one.reused]
+    assert counts == {name: images.count(name) for name in counts}
+    reused = [one.image for one in outcome if one.reused]
     assert ("frozen" in reused) == (kind == "frozen"), (
         "its features are reused, and it is reported all the same"
     )
@@ -246,20 +246,20 @@ def embedded_clips(monkeypatch):
 
 @pytest.mark.parametrize("frames", [1, 3])
 def test_reuse_of_equal_clips_changes_no_bit(encoder, embedded_clips, frames):
-    """Pictures stand still, move, and stand still again.
+    """Images stand still, move, and stand still again.
 
     One changed pixel of the network's input is a new clip.
     """
     rng = np.random.default_rng(0)
-    picture = rng.integers(0, 256, (28, 28, 3), np.uint8)
-    dotted = picture.copy()
+    image = rng.integers(0, 256, (28, 28, 3), np.uint8)
+    dotted = image.copy()
     dotted[5, 7, 1] ^= 1
-    film = np.stack([picture] * 5 + [dotted] * 4 + [picture] * 4)
+    video = np.stack([image] * 5 + [dotted] * 4 + [image] * 4)
     found = streams.collect(
-        streams.stream(encoder, Film(film), live=False, sensor=DIGIT, frames=frames)
+        streams.stream(encoder, Video(video), live=False, sensor=DIGIT, frames=frames)
     )
-    small = touch_evaluation(list(film[..., ::-1]), 28)
-    clips = np.stack([small[end - frames : end] for end in range(frames, len(film) + 1)])
+    small = touch_evaluation(list(video[..., ::-1]), 28)
+    clips = np.stack([small[end - frames : end] for end in range(frames, len(video) + 1)])
     embed = streams.compile_for_one(encoder, DIGIT, frames)
     np.testing.assert_array_equal(
         found.values, [np.asarray(embed(jax.device_put(one[None])))[0] for one in clips]
@@ -299,7 +299,7 @@ def test_noise_is_reused_and_a_small_touch_is_not():
 
 
 class RatedCamera:
-    """A camera that says it gives 250 frames/s: every second picture is new, or `every`th."""
+    """A camera that says it gives 250 frames/s: every second image is new, or `every`th."""
 
     def __init__(self, every: int, frames: int = 60) -> None:
         self.every = every

@@ -129,10 +129,10 @@ def test_matching_logits_have_all_their_digits(head):
         )
 
 
-@pytest.mark.parametrize(("join", "width"), [("mean", 12), ("sum", 12), ("concat", 36)])
-def test_long_clips_are_segments_of_three(join, width):
+@pytest.mark.parametrize(("aggregation", "width"), [("mean", 12), ("sum", 12), ("concat", 36)])
+def test_long_clips_are_segments_of_three(aggregation, width):
     clip = clips(8)
-    z = encode(PARAMS, clip, SENSOR, join)
+    z = encode(PARAMS, clip, SENSOR, aggregation)
     parts = [np.asarray(encode(PARAMS, clip[:, s : s + 3], SENSOR)) for s in (0, 3, 5)]
     expected = {
         "mean": np.mean(parts, axis=0),
@@ -140,7 +140,7 @@ def test_long_clips_are_segments_of_three(join, width):
         "concat": np.concatenate(parts, axis=1),
     }
     assert z.shape == (2, width)
-    np.testing.assert_allclose(z, expected[join], atol=3e-5)
+    np.testing.assert_allclose(z, expected[aggregation], atol=3e-5)
 
 
 def flops(function, *args):

@@ -92,14 +92,14 @@ def test_the_products_of_info_nce_are_whole_on_every_device():
     assert text.count("dot_general[") == 3 and text.count("HIGHEST") == 6, text
 
 
-def test_groups_keep_negatives_in_their_share():
+def test_groups_keep_negatives_in_their_fraction():
     a = unit(8, seed=1)
     b = unit(8, seed=2)
     present = PRESENCE["mixed"]
     ours = nce(a, b, 9.0, present, groups=2)
-    shares = [loop_info_nce(a[s], b[s], 9.0, present[s]) for s in (slice(0, 4), slice(4, 8))]
-    np.testing.assert_allclose(ours, np.mean(shares), rtol=1e-5)
-    # the other share has no pair: 0, and it counts in the mean
+    fractions = [loop_info_nce(a[s], b[s], 9.0, present[s]) for s in (slice(0, 4), slice(4, 8))]
+    np.testing.assert_allclose(ours, np.mean(fractions), rtol=1e-5)
+    # the other fraction has no pair: 0, and it counts in the mean
     half = present & (np.arange(8) < 4)
     ours = nce(a, b, 9.0, half, groups=2)
     np.testing.assert_allclose(ours, loop_info_nce(a[:4], b[:4], 9.0, half[:4]) / 2, rtol=1e-5)
@@ -212,7 +212,7 @@ def test_rows_have_unit_length_and_mean_zero_before_it():
 
 
 @pytest.mark.parametrize("which", range(3))
-def test_what_all_samples_share_does_not_count(which):
+def test_what_all_samples_fraction_does_not_count(which):
     z = draw()
     moved = [x + (10.0 * np.arange(E, dtype="f4") if i == which else 0.0) for i, x in enumerate(z)]
     np.testing.assert_allclose(loss(moved), loss(z), rtol=1e-4)

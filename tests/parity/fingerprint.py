@@ -51,7 +51,7 @@ SEED = 7
 SIDE = 56  # pixels of an image in training
 SENSORS = ("gelsight_mini", "digit")
 LIBRARIES = ("jax", "jaxlib", "numpy", "onnxruntime", "scikit-learn")
-TIMING = ("samples_per_second", "wait", "wait_share")  # metrics that differ between equal runs
+TIMING = ("samples_per_second", "wait", "wait_fraction")  # metrics that differ between equal runs
 
 
 # Parts. Each runs in an empty folder, whose contents later parts read, and yields arrays by name.
@@ -83,7 +83,7 @@ def press_of(touch: Any) -> list[np.ndarray]:
     """Return three frames that go from the untouched gel to the touch."""
     gel = touch.background.astype(np.float64)
     change = touch.frame.astype(np.float64) - gel
-    return [np.uint8(np.round(gel + share * change)) for share in (0.0, 0.5, 1.0)]
+    return [np.uint8(np.round(gel + fraction * change)) for fraction in (0.0, 0.5, 1.0)]
 
 
 def features_by_xla() -> Arrays:
@@ -132,7 +132,7 @@ def arrays_of_record(record: Any, prefix: str) -> Arrays:
 
 
 def simulated_manifest() -> Arrays:
-    """Write a small data set by `data simulate`; return its table, pictures and file hashes."""
+    """Write a small data set by `data simulate`; return its table, images and file hashes."""
     command(
         *("data", "simulate", "--out", "scenes", "--touches", 24, "--objects", 16, "--size", 64),
         *("--frames", 4, "--sensors", *SENSORS, "--seed", SEED, "--vision", 0.9, "--text", 0.9),
@@ -145,7 +145,7 @@ def simulated_manifest() -> Arrays:
     hashes = [f"{path} {hashlib.sha256(path.read_bytes()).hexdigest()}" for path in files]
     arrays["files"] = np.array(hashes)
     for path in files:
-        if path.name in ("002.jpg", "photo.jpg"):  # a few, to see how far pictures differ
+        if path.name in ("002.jpg", "photo.jpg"):  # a few, to see how far images differ
             arrays[f"picture/{path}"] = cv2.imread(str(path))
     return arrays
 
@@ -215,12 +215,12 @@ def metrics_of(run: str) -> Arrays:
 
 def endless1() -> Arrays:
     """Return metrics of 5 steps of stage 1 on touches that are simulated while it trains."""
-    return endless(1, "--model.fields", 8, "--data.clip-share", 0)
+    return endless(1, "--model.fields", 8, "--data.clip-fraction", 0)
 
 
 def endless2() -> Arrays:
     """Return metrics of 5 steps of stage 2 on touches that are simulated while it trains."""
-    return endless(2, "--data.clip-share", 0, "--model.match-head", "cosine")
+    return endless(2, "--data.clip-fraction", 0, "--model.match-head", "cosine")
 
 
 def endless(stage: int, *words: Any) -> Arrays:
@@ -244,7 +244,7 @@ def endless(stage: int, *words: Any) -> Arrays:
 
 
 def simulated_touch() -> Arrays:
-    """Return picture, gel, fields and force of two presses of a wavy ball, by two sensors."""
+    """Return image, gel, fields and force of two presses of a wavy ball, by two sensors."""
     line = (np.arange(200) - 99.5) / 10  # mm
     away = np.hypot(line[None], line[:, None])
     ball = np.sqrt(np.maximum(36.0 - away**2, 0.0)) - 6.0

@@ -214,7 +214,7 @@ def golden_params(folder: Path, file: str, model: ModelConfig, scale: Any = None
 
 
 def channel_last(pixels: np.ndarray, *, clip: bool = True) -> np.ndarray:
-    """(B, 3, H, W) or (B, T, 3, H, W) -> (B, T, H, W, 3), or (B, H, W, 3) of a photograph with
+    """(B, 3, H, W) or (B, T, 3, H, W) -> (B, T, H, W, 3), or (B, H, W, 3) of an RGB image with
     `clip` False.
     """
     pixels = np.moveaxis(pixels, -3, -1)

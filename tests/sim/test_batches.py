@@ -11,7 +11,7 @@ from batch_leaves import assert_same
 from anytouch_jax.config import Stack, preset
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.sim.batches import SIMULATED, SimulatedLoader, _partners, caption_tokenizer
-from anytouch_jax.sim.preparation import MOVED, field_batch, moved_gel
+from anytouch_jax.sim.preparation import MOVED, field_batch, misregistered_background
 from anytouch_jax.sim.real import load_real
 from anytouch_jax.training import pretrain
 
@@ -34,7 +34,7 @@ def tiny(stage=1, **changes):
     settings = {
         "data.manifests": (SIMULATED,),
         "data.batch_size": 8,
-        "data.clip_share": 0.0,
+        "data.clip_fraction": 0.0,
         "data.jitter": (0.0,) * 4,
         "data.background": "either",
         "simulated.objects": 13,
@@ -49,7 +49,7 @@ def tiny(stage=1, **changes):
 
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory):
-    """Two units that touch two places, four frames each, one without a picture of its gel."""
+    """Two units that touch two places, four frames each, one without an image of its gel."""
     folder = tmp_path_factory.mktemp("real")
     rng = np.random.default_rng(0)
     lines = ["path,sensor,sequence,frame_index,split,touch,unit,background_path,text"]
@@ -117,18 +117,18 @@ def test_real_partners_are_of_the_same_place_and_another_unit(recordings):
     other = np.asarray(_partners(jax.random.key(0), pairs, at))
     np.testing.assert_array_equal(np.asarray(pairs.place)[other], np.asarray(pairs.place))
     assert np.mean(np.asarray(pairs.unit)[other] != np.asarray(pairs.unit)) > 0.9
-    gels = np.asarray(real.gel)
-    assert len(gels) == 2 and np.any(np.all(gels[:, 0] == 90, axis=(1, 2, 3))), (
-        "one stored picture, one median"
+    backgrounds = np.asarray(real.gel)
+    assert len(backgrounds) == 2 and np.any(np.all(backgrounds[:, 0] == 90, axis=(1, 2, 3))), (
+        "one stored image, one median"
     )
 
 
-def test_a_gel_moves_by_fractions_of_a_pixel_since_its_picture():
+def test_a_gel_moves_by_fractions_of_a_pixel_since_its_image():
     touches = SimulatedLoader(tiny()).touches(0)
     down, across = np.mgrid[:28, :28]
     ramp = np.stack([3 * across, 5 * down, 0 * down], -1).astype(np.uint8)
     behind = np.broadcast_to(ramp, (2000, 1, 28, 28, 3))
-    moved = moved_gel(jax.random.key(0), touches._replace(background=behind))
+    moved = misregistered_background(jax.random.key(0), touches._replace(background=behind))
     change = (ramp - np.asarray(moved.background)[:, 0])[:, 10:-10, 10:-10, :2].mean((1, 2)) / (
         3,
         5,
@@ -162,8 +162,8 @@ def test_a_run_for_a_time_follows_the_time(tmp_path):
     )
 
 
-def test_the_pressure_in_a_picture_adds_up_to_the_force_in_newtons():
-    """Both go through width and proportions of the picture: 4:3 of a GelSight Mini, 3:4 of a DIGIT.
+def test_the_pressure_in_a_image_adds_up_to_the_force_in_newtons():
+    """Both go through width and proportions of the image: 4:3 of a GelSight Mini, 3:4 of a DIGIT.
 
     The label of the simulator comes from its own grid, which is square and has no zoom.
     """
@@ -189,6 +189,6 @@ def test_the_pressure_in_a_picture_adds_up_to_the_force_in_newtons():
     np.testing.assert_allclose(newtons, shown, rtol=1e-4, atol=1e-5)
     for group in (tall, ~tall):
         inside = group & ~np.isnan(labels)
-        assert inside.sum() >= 8, "enough touches whose whole contact is in the picture"
+        assert inside.sum() >= 8, "enough touches whose whole contact is in the image"
         ratio = np.median(shown[inside] / labels[inside])
         assert ratio == pytest.approx(1, abs=0.07), "few pixels, so single sums are rough"

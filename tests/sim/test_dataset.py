@@ -75,7 +75,7 @@ def test_the_manifest_is_one_that_the_project_reads(made):
     )
 
 
-def test_shares_and_labels_are_as_drawn(made):
+def test_fractions_and_labels_are_as_drawn(made):
     rows = [
         row for row in manifests.read(made / "manifest.parquet").table.to_pylist() if row["touch"]
     ]

@@ -128,8 +128,8 @@ def test_kinds_that_are_held_out_never_occur():
         endless.objects_of(Scenes(objects=5), "test")
 
 
-def test_the_width_is_that_of_the_picture_which_shows_a_part_of_the_field(touches, drawn):
-    """A unit's camera may show less than the gel: `width` turns lengths of the picture into mm."""
+def test_the_width_is_that_of_the_image_which_shows_a_part_of_the_field(touches, drawn):
+    """A unit's camera may show less than the gel: `width` turns lengths of the image into mm."""
     zoom = drawn.clip.unit.zoom
     across, down = drawn.numbers.field[..., 1], drawn.numbers.field[..., 0]
     assert zoom.min() < 0.9, "some cameras show a part"

@@ -211,7 +211,7 @@ def test_mistakes_get_a_sentence():
 def test_xla_is_given_no_large_products_of_constants(fidelity):
     """Such products are computed while XLA compiles, slowly and with alarms on the terminal.
 
-    The matrices that enlarge a coarse grid are small. Those of the gel and of the picture took 14
+    The matrices that enlarge a coarse grid are small. Those of the gel and of the image took 14
     million multiplications.
     """
 

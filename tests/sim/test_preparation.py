@@ -46,17 +46,17 @@ class FixedDraws:
     ],
 )
 def test_numpy_and_jax_augment_alike(tosses, turn, zoom, across, down):
-    """The same draws give the same picture, to the rounding of OpenCV's fixed point."""
+    """The same draws give the same image, to the rounding of OpenCV's fixed point."""
     # Turns are drawn to both sides alike, and the two forms count them in opposite directions.
     config = DataConfig(flip=0.5, affine=(30.0, 0.2, 0.5), jitter=(0.0,) * 4)
     size = 40
     row, column = np.mgrid[:size, :size] / size
     waves = [np.sin(5 * row + 3 * column), np.cos(7 * column - 2 * row), row * column]
-    picture = np.stack([120 + 100 * wave for wave in waves], -1).astype(np.uint8)
+    image = np.stack([120 + 100 * wave for wave in waves], -1).astype(np.uint8)
     host = touch_transform(
-        picture[None], size, FixedDraws(tosses, (turn, zoom, across, down)), config
+        image[None], size, FixedDraws(tosses, (turn, zoom, across, down)), config
     )
-    flipped = picture[:, :: -1 if tosses[0] < 0.5 else 1][:: -1 if tosses[1] < 0.5 else 1]
+    flipped = image[:, :: -1 if tosses[0] < 0.5 else 1][:: -1 if tosses[1] < 0.5 else 1]
     draws = jnp.array([-turn, zoom, down, across, 0.0], jnp.float32)
     device = _warped(flipped[None], draws, TouchAugmentation.of(config))
     apart = np.abs(host.astype(int) - np.asarray(device, int))

@@ -134,12 +134,12 @@ def takes(_small_grid):
     return found
 
 
-def test_a_camera_gives_pictures_and_the_fields_asked_for(takes):
+def test_a_camera_gives_images_and_the_fields_asked_for(takes):
     for recording, take in takes["digit"]:
         # portrait, square pixels
         assert take.image.shape == (5, 43, 32, 3) and take.image.dtype == np.uint8
         assert take.background.shape == (43, 32, 3)
-        # at the pixels of the picture
+        # at the pixels of the image
         assert take.field.shape == (5, 43, 32, 3)
         changed = np.abs(take.image.astype(float) - take.background).mean((1, 2, 3))
         assert changed[recording.depth > 0.3].min() > 1.2 * changed[recording.depth <= 0].max(
@@ -189,7 +189,7 @@ def test_labels_agree_with_the_pressure(takes):
         pitch = float(unit.zoom) * DIGIT.field[1] / 32  # mm of a pixel
         edge = pressure[:, [0, -1]].sum((1, 2)) + pressure[:, :, [0, -1]].sum((1, 2))
         touching = recording.depth > 0
-        # the picture shows all of the contact
+        # the image shows all of the contact
         whole = touching & (edge < 1e-2 * pressure.sum((1, 2)))
         force = pressure.sum((1, 2)) * pitch**2 * 1e-3
         np.testing.assert_allclose(take.labels["force"][whole], force[whole], rtol=0.1)

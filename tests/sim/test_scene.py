@@ -46,7 +46,7 @@ def test_what_cannot_be_simulated_is_refused(change, sentence):
         replace(SCENES, **change)
 
 
-def test_splits_share_no_pair_of_primitive_and_texture():
+def test_splits_fraction_no_pair_of_primitive_and_texture():
     kinds = {
         split: {t.kind for t, s in zip(THINGS, SPLITS, strict=True) if s == split}
         for split in set(SPLITS)
@@ -100,7 +100,7 @@ def test_one_device_of_each_sensor_mounted_straight():
     assert not np.array_equal(several[0]["digit"].unit.tint, several[0]["duragel"].unit.tint)
 
 
-def test_fine_recordings_move_alike_and_coarse_ones_share_only_the_place():
+def test_fine_recordings_move_alike_and_coarse_ones_fraction_only_the_place():
     fine = list(recordings(SCENES, 5).values())
     assert all(
         np.array_equal(fine[0].motion, r.motion) and np.array_equal(fine[0].depth, r.depth)
@@ -161,7 +161,7 @@ def test_a_gesture_presses_then_moves_then_lets_go(motion):
     assert (np.diff(moved @ np.sign([1.5, -0.5, 0.2])) >= -1e-12).all()
 
 
-def test_directions_are_those_of_the_picture():
+def test_directions_are_those_of_the_image():
     recording = recordings(SCENES, 0)["digit"]
     assert (
         scene.directions(recording._replace(gesture=gesture("slide", (2, 0)), depth=-np.ones(10)))[

@@ -23,10 +23,10 @@ class BlankRecorder:
         labels = {name: rng.random(frames) for name in ("force", "depth", "area", "x", "y", "slip")}
         if SENSORS[recording.sensor].kind == "field":
             return ClipOutput(None, None, rng.random((frames, 20, 20, 6), np.float32), labels)
-        picture = np.full((frames, 43, 32, 3), recording.seed % 251, np.uint8)
+        image = np.full((frames, 43, 32, 3), recording.seed % 251, np.uint8)
         field = (
             rng.random((frames, 12, 8, len(self.scenes.fields)), np.float32)
             if self.scenes.fields
             else None
         )
-        return ClipOutput(picture, picture[0], field, labels)
+        return ClipOutput(image, image[0], field, labels)

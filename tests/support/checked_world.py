@@ -11,15 +11,15 @@ def finding_rows(report):
     return {finding.kind: finding.rows.tolist() for finding in report.findings}
 
 
-def patterned(picture):
-    """The picture u8 (h, w, 3) with a faint ramp over it."""
-    height, width = picture.shape[:2]
+def patterned(image):
+    """The image u8 (h, w, 3) with a faint ramp over it."""
+    height, width = image.shape[:2]
     ramp = np.add.outer(np.arange(height) * 30 // height, np.arange(width) * 20 // width)[..., None]
-    return np.clip(picture + ramp, 0, 255).astype(np.uint8)
+    return np.clip(image + ramp, 0, 255).astype(np.uint8)
 
 
 def with_patterns(make):
-    """The fixture `make`, with a pattern over every picture, because pictures of one colour are a
+    """The fixture `make`, with a pattern over every image, because images of one colour are a
     finding.
     """
 

@@ -59,7 +59,7 @@ class FaultyCamera:
         self.released = True
 
 
-class Film:
+class Video:
     """A video of given frames BGR u8 (n, h, w, 3), without the errors of a codec."""
 
     def __init__(self, frames: Iterable[np.ndarray]) -> None:

@@ -1,4 +1,4 @@
-"""Pictures of a simulated device with hidden parameters, as if a user had taken them."""
+"""Images of a simulated device with hidden parameters, as if a user had taken them."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from anytouch_jax.sim.scene import Scenes
 from anytouch_jax.sim.sensing.optics import tilt
 from anytouch_jax.sim.sensing.sensors import POWERS, SENSORS, draw_unit
 
-SHAPE = 120, 160  # pixels of a picture, or upright
-SHARE = 0.8  # of the touches that press
+SHAPE = 120, 160  # pixels of an image, or upright
+FRACTION = 0.8  # of the touches that press
 
 
 class Hidden(NamedTuple):
-    """Pictures u8 (N, h, w, 3), the device, and the numbers of its family.
+    """Images u8 (N, h, w, 3), the device, and the numbers of its family.
 
-    A picture shows `width` mm.
+    An image shows `width` mm.
     """
 
     frames: Any
@@ -46,12 +46,12 @@ def _program(shape: tuple[int, int]) -> Any:
 def _drawn(name: str, count: int) -> Any:
     things = endless.objects_of(Scenes(objects=48, seed=7, depth=(0.3, 1.0)))[:24]
     world = endless.make_world(things, (name,))
-    sampling = endless.Sampling(takes=1, depth=(0.3, 1.0), free=1 - SHARE)
+    sampling = endless.Sampling(takes=1, depth=(0.3, 1.0), free=1 - FRACTION)
     draw = jax.jit(partial(endless.draw_touches, sampling=sampling, count=count))
     return partial(draw, world=world)
 
 
-def hidden_pictures(
+def hidden_images(
     name: str,
     seed: int,
     count: int = 20,
@@ -63,7 +63,7 @@ def hidden_pictures(
     deepest: float = 1.0,
     **unit_values: Any,
 ) -> Hidden:
-    """Return pictures of a device of a known family whose lights have changed places and whose
+    """Return images of a device of a known family whose lights have changed places and whose
     parameters are drawn.
     """
     rng = np.random.default_rng([seed, 59])
@@ -120,7 +120,7 @@ def hidden_pictures(
 
 
 def colours_of_dents(look: Any, halo_mm: Any, gain: Any = 1.0, angle: float = 0.0) -> np.ndarray:
-    """Return the colours (3, 3) that a picture shows in its middle: by slope along x and y, and by
+    """Return the colours (3, 3) that an image shows in its middle: by slope along x and y, and by
     mm of depth.
 
     They are the least squares fit to round dents of several widths.
@@ -151,7 +151,7 @@ def colours_of_dents(look: Any, halo_mm: Any, gain: Any = 1.0, angle: float = 0.
 
 
 def true_colours(hidden: Hidden) -> np.ndarray:
-    """Return the colours (3, 3) of a device's dents in the middle of its picture."""
+    """Return the colours (3, 3) of a device's dents in the middle of its image."""
     u, v = np.asarray(hidden.unit.lights)[:2]
     terms = np.array([1, u, v, u * u, u * v, v * v])
     light = hidden.numbers.photometry

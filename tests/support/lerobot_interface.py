@@ -65,8 +65,8 @@ class OpenCVCameraConfig(CameraConfig):
     index_or_path: Any
 
 
-class FilmCamera(Camera):
-    """In the place of LeRobot's OpenCV camera: its pictures come from `frames`, one after the
+class VideoCamera(Camera):
+    """In the place of LeRobot's OpenCV camera: its images come from `frames`, one after the
     other.
     """
 
@@ -83,7 +83,7 @@ class FilmCamera(Camera):
 
     @staticmethod
     def find_cameras() -> list[dict[str, Any]]:
-        return [{"name": "film", "type": "OpenCV", "id": 0}]
+        return [{"name": "video", "type": "OpenCV", "id": 0}]
 
     def connect(self, warmup: bool = True) -> None:
         self._next = 0
@@ -115,7 +115,7 @@ def modules() -> dict[str, ModuleType]:
         "lerobot.cameras.camera": {"Camera": Camera},
         "lerobot.cameras.configs": {"CameraConfig": CameraConfig},
         "lerobot.cameras.opencv": {
-            "OpenCVCamera": FilmCamera,
+            "OpenCVCamera": VideoCamera,
             "OpenCVCameraConfig": OpenCVCameraConfig,
         },
     }

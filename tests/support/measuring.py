@@ -25,6 +25,6 @@ def measuring_weights(path: Path, calibration: dict | None = None, *, fields: in
 
 
 def gel(height: int = 48, width: int = 64) -> np.ndarray:
-    """Return an even picture u8 (height, width, 3) in three colours, with noise."""
+    """Return an even image u8 (height, width, 3) in three colours, with noise."""
     noise = np.random.default_rng(0).integers(0, 6, (height, width, 3))
     return (np.array([90, 110, 140]) + noise).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Datasets of tiny pictures, laid out like the originals."""
+"""Datasets of tiny images, laid out like the originals."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -14,7 +14,7 @@ BYTES = {ending: cv2.imencode(ending, PIXELS)[1].tobytes() for ending in (".png"
 
 
 def fill(root: Path, files: Iterable[str]) -> None:
-    """Write a tiny picture to each of `files` under `root`."""
+    """Write a tiny image to each of `files` under `root`."""
     for name in files:
         path = root / name
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""A small world on disk (two sensors at the same places, one photograph, a few captions) and runs
+"""A small world on disk (two sensors at the same places, one RGB image, a few captions) and runs
 trained on it.
 """
 
@@ -18,7 +18,7 @@ from anytouch_jax.training import pretrain
 from anytouch_jax.weights.tree import flatten
 
 # the fields of a line that differ between equal runs
-TIMING = ("samples_per_second", "wait", "wait_share")
+TIMING = ("samples_per_second", "wait", "wait_fraction")
 COLUMNS = (
     "path",
     "sensor",
@@ -52,7 +52,7 @@ SIZES = {
     "model.decoder.depth": 1,
     "model.decoder.heads": 2,
     "model.decoder.mlp": 16,
-    "data.clip-share": 0,
+    "data.clip-fraction": 0,
 }
 
 

@@ -1,4 +1,4 @@
-"""Records of the matrix with made-up numbers: what the tables and pictures read."""
+"""Records of the matrix with made-up numbers: what the tables and images read."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -65,7 +65,7 @@ COLUMNS = {
     "ablations": (*FOUR, *FORM),
     "q3": (*SIX, *FORM, *MOVING),
     "q2": (
-        Column("class token", "top-1", "share"),
+        Column("class token", "top-1", "fraction"),
         *(Column("class token", one, one) for one in SILHOUETTES),
     ),
 }
@@ -74,7 +74,7 @@ COLUMNS = {
 def _rows(leaf: plan.Leaf, view: str, task: str, metric: str, mean: Mean) -> list[dict[str, Any]]:
     value = mean(leaf.question, leaf.name, leaf.seed, view, task)
     shared = {"view": view, "task": task, "metric": metric, "test": 100}
-    both = ("honest",) if leaf.question == "q2" else ("honest", "published")
+    both = ("grouped",) if leaf.question == "q2" else ("grouped", "released")
     return [
         shared | {"protocol": one, "mean": value, "low": value - 0.05, "high": value + 0.05}
         for one in both

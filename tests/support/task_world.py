@@ -1,4 +1,4 @@
-"""Manifests without pictures for probing tasks, and features like those of a network."""
+"""Manifests without images for probing tasks, and features like those of a network."""
 
 from pathlib import Path
 from typing import Any

@@ -46,9 +46,11 @@ class Compiled:
 
     @cache  # noqa: B019  of the few networks of a module
     def __getattr__(self, name: str) -> Any:
-        static = {"encode_touch": "join", "encode_poolings": "join", "reconstruct": "frames"}.get(
-            name
-        )
+        static = {
+            "encode_touch": "aggregation",
+            "encode_poolings": "aggregation",
+            "reconstruct": "frames",
+        }.get(name)
         return jax.jit(getattr(self.net, name), static_argnames=static)
 
 

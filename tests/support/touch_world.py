@@ -46,7 +46,7 @@ def make_touches(
                 for frame in range(frames):
                     now = force * (frame + 1) / frames
                     path = f"{split}{number}_{name}_{frame}.png"
-                    image = picture(texture, place, now, tint(sensors, name), size)
+                    image = render(texture, place, now, tint(sensors, name), size)
                     cv2.imwrite(
                         str(folder / path), image + rng.integers(0, 5, image.shape, np.uint8)
                     )
@@ -61,7 +61,7 @@ def tint(sensors: tuple[str, ...], name: str) -> int:
     return 60 + 50 * sensors.index(name)
 
 
-def picture(
+def render(
     texture: np.ndarray, place: np.ndarray, force: float, ground: int, size: int
 ) -> np.ndarray:
     """u8 (size, size, 3): a disc of texture on an even ground; one pixel is 8 / size mm."""

@@ -3,7 +3,7 @@
 import time
 
 import numpy as np
-from press_films import gel_frame
+from press_videos import gel_frame
 
 SCRIPT = "<script>document.title = 'broken'</script><img src=x onerror=alert(1)>"
 DEPTHS = (0, 60, 90)  # of the frames of each recording

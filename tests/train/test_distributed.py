@@ -117,8 +117,8 @@ def test_a_failed_join_is_one_sentence_that_names_the_variables(
 
 
 def test_a_ballot_gives_the_largest_vote():
-    ballot = distributed.Ballot(make_mesh(fsdp=2))
-    assert [[int(one) for one in ballot.cast(number, 3)] for number in (0, 15)] == [[0, 3], [15, 3]]
+    flags = distributed.FlagReduction(make_mesh(fsdp=2))
+    assert [[int(one) for one in flags.cast(number, 3)] for number in (0, 15)] == [[0, 3], [15, 3]]
 
 
 def lock(run_dir, mesh=None, **more):

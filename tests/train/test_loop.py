@@ -239,7 +239,7 @@ def test_the_time_that_a_step_waits_for_its_batch_is_written(
     # A line is written when the next batch has come: the first one tells of two batches, the last
     # one of none.
     assert [line["wait"] for line in lines] == [first, other, other, 0]
-    assert [line["wait_share"] for line in lines] == [first / 8, other / 4, other / 4, 0]
+    assert [line["wait_fraction"] for line in lines] == [first / 8, other / 4, other / 4, 0]
 
 
 @pytest.mark.parametrize("fsdp", [1, 4])

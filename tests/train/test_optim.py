@@ -43,14 +43,14 @@ def test_schedule_values(decay, warmup, total):
     def by_hand(t):
         if t < warmup:
             return PEAK * t / warmup
-        share = (
+        fraction = (
             min(1.0, (t - warmup) / (total - warmup))
             if total > warmup
             else 0.0
             if t == warmup
             else 1.0
         )
-        height = 1 - share if decay == "linear" else 0.5 * (1 + math.cos(math.pi * share))
+        height = 1 - fraction if decay == "linear" else 0.5 * (1 + math.cos(math.pi * fraction))
         return FLOOR + (PEAK - FLOOR) * height
 
     times = [

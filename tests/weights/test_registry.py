@@ -64,7 +64,7 @@ def test_a_repository_of_the_hub_is_loaded(tmp_path, monkeypatch, address, revis
 
     def snapshot_download(repository, *, revision, allow_patterns):
         asked.append((repository, revision))
-        names = [*needed, "flax_model.msgpack", "picture.png"]
+        names = [*needed, "flax_model.msgpack", "image.png"]
         assert (
             list(huggingface_hub.utils.filter_repo_objects(names, allow_patterns=allow_patterns))
             == needed

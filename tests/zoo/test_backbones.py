@@ -1,8 +1,8 @@
-"""Newer backbones of photographs against timm 1.0.31 and transformers 5.24 with torch 2.13, and
+"""Newer backbones of RGB images against timm 1.0.31 and transformers 5.24 with torch 2.13, and
 what is not read.
 
 data/backbones.npz has networks of width 16, depth 2, two heads and patches of 4 pixels: drawn
-weights (multiples of 1/16, stored as float16), drawn pictures (2, H, W, 3) and the tokens after the
+weights (multiples of 1/16, stored as float16), drawn images (2, H, W, 3) and the tokens after the
 last norm, in float32 on a CPU. They come from `VisionTransformer(reg_tokens=4, no_embed_class=True,
 init_values=1e-5)` and `Eva(rope_type="dinov3", num_reg_tokens=4)` of timm, and from
 `DINOv3ViTModel` and `SiglipVisionModel`. Meta's layout is timm's by other names, given to timm's
@@ -46,28 +46,28 @@ def written(folder: Path, weights: dict[str, np.ndarray], **config) -> Path:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_tokens_are_those_of_the_library(name, tmp_path):
-    pictures = ARRAYS[f"{name}|input"]
+    images = ARRAYS[f"{name}|input"]
     tokens = ARRAYS[f"{name}|tokens"]
     encoder = load_encoder(
-        written(tmp_path / "one", weights_of(name)), heads=2, image_size=pictures.shape[1:3]
+        written(tmp_path / "one", weights_of(name)), heads=2, image_size=images.shape[1:3]
     )
-    np.testing.assert_allclose(encoder.encode_tokens(pictures), tokens, rtol=1e-4, atol=2e-5)
+    np.testing.assert_allclose(encoder.encode_tokens(images), tokens, rtol=1e-4, atol=2e-5)
     start = 0 if "SigLIP" in name else 5
     np.testing.assert_allclose(
-        encoder.encode_touch(pictures, pooling="mean"), tokens[:, start:].mean(1), atol=2e-5
+        encoder.encode_touch(images, pooling="mean"), tokens[:, start:].mean(1), atol=2e-5
     )
     own = ARRAYS.get(f"{name}|pooled", tokens.mean(1) if "SigLIP" in name else tokens[:, 0])
-    np.testing.assert_allclose(encoder.encode_touch(pictures), own, rtol=1e-4, atol=2e-5)
+    np.testing.assert_allclose(encoder.encode_touch(images), own, rtol=1e-4, atol=2e-5)
 
 
 @pytest.mark.parametrize("name", ["HF DINOv3", "HF SigLIP 2"])
 def test_other_spellings_of_keys_and_a_nested_config(name, tmp_path):
     weights = weights_of(name)
-    pictures = ARRAYS[f"{name}|input"]
-    size = pictures.shape[1:3]
+    images = ARRAYS[f"{name}|input"]
+    size = images.shape[1:3]
     wanted = load_encoder(
         written(tmp_path / "one", weights), heads=2, image_size=size
-    ).encode_touch(pictures)
+    ).encode_touch(images)
     text = {
         "text_model.embeddings.token_embedding.weight": np.zeros((3, 16), "f4"),
         "logit_bias": np.zeros(1, "f4"),
@@ -76,7 +76,7 @@ def test_other_spellings_of_keys_and_a_nested_config(name, tmp_path):
     other = {f"{prefix}{key.removeprefix('model.')}": x for key, x in weights.items()} | more
     folder = written(tmp_path / "two", other, vision_config={"num_attention_heads": 2})
     np.testing.assert_array_equal(
-        load_encoder(folder, image_size=size).encode_touch(pictures), wanted
+        load_encoder(folder, image_size=size).encode_touch(images), wanted
     )
 
 

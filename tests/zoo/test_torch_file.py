@@ -35,7 +35,7 @@ def test_reads_every_plain_type(write_torch, legacy):
         np.testing.assert_array_equal(read[name], array)
 
 
-def test_views_share_and_stride(write_torch):
+def test_views_fraction_and_stride(write_torch):
     data = np.arange(12, dtype="f4")
     grid = data.reshape(3, 4)
     views = {

@@ -156,7 +156,7 @@ UNUSED = {
 
 
 def compare(
-    work: Workload, python: Path, rounds: int, peak_size: int | None, rivals: tuple[str, ...]
+    work: Workload, python: Path, rounds: int, peak_size: int | None, negatives: tuple[str, ...]
 ) -> dict[str, Any]:
     """Rows of ours and of PyTorch for a workload. Raises SystemExit where the losses differ."""
     state = first_state(work.config)
@@ -178,7 +178,7 @@ def compare(
             exact = reference(work, params)
             errors = {}
             notes = {}
-            for rival in rivals:
+            for rival in negatives:
                 start = time.perf_counter()
                 try:
                     answer = worker.ask(
@@ -261,7 +261,7 @@ def timed(
                 "samples_per_second": work.samples / float(np.median(middle)),
                 "gflops": work.operations / float(np.median(middle)) / 1e9,
                 "best_ratio": float(values.min() / seconds[0].min()),
-                "peak_share": work.operations / float(np.median(middle)) / rate,
+                "peak_fraction": work.operations / float(np.median(middle)) / rate,
                 "p50": float(np.percentile(values, 50)),
                 "p99": float(np.percentile(values, 99)),
                 **error,
@@ -281,7 +281,7 @@ def main() -> None:
     parser.add_argument("--preset", default="small", choices=("tiny", "small", "base", "large"))
     parser.add_argument("--batch", type=int)
     parser.add_argument("--rounds", type=int, default=9)
-    parser.add_argument("--rivals", nargs="*", default=list(RIVALS), choices=RIVALS)
+    parser.add_argument("--negatives", nargs="*", default=list(RIVALS), choices=RIVALS)
     parser.add_argument(
         "--out", type=Path, default=Path("runs/bench/torch.jsonl"), help="file of results"
     )
@@ -307,7 +307,7 @@ def main() -> None:
     for what in options.what:
         for work in workloads(what, options.preset, options.batch):
             results[work.name] = compare(
-                work, options.torch, options.rounds, options.peak_size, tuple(options.rivals)
+                work, options.torch, options.rounds, options.peak_size, tuple(options.negatives)
             )
             write_record(options.out, key, about | {"results": results})
             print(f"### {work.name}\n\n{table_of(results[work.name]['rows'])}\n", flush=True)

@@ -1,4 +1,4 @@
-"""The tactile camera: LeRobot's OpenCV camera, with oriented and subtracted pictures, or depth."""
+"""The tactile camera: LeRobot's OpenCV camera, with oriented and subtracted images, or depth."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from lerobot.cameras.camera import Camera
 from lerobot.cameras.opencv import OpenCVCamera, OpenCVCameraConfig
 
 from anytouch_jax import Encoder, load_encoder
-from anytouch_jax.data.background.rule import RunningGel
+from anytouch_jax.data.background.rule import RunningBackground
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.transforms import orient_frame, subtract_background
 from anytouch_jax.encoder.measured import Fields, Measure
 from lerobot_camera_anytouch.config_anytouch import AnyTouchCameraConfig
-from lerobot_camera_anytouch.film import FilmCamera
+from lerobot_camera_anytouch.video import VideoCamera
 
 
 class AnyTouchCamera(Camera):
-    """A camera behind a gel. Pictures are RGB u8 (height, width, 3)."""
+    """A camera behind a gel. Images are RGB u8 (height, width, 3)."""
 
     def __init__(self, config: AnyTouchCameraConfig) -> None:
         super().__init__(config)
@@ -28,17 +28,17 @@ class AnyTouchCamera(Camera):
         width = config.width
         height = config.height
         if config.rotate in (90, 270):
-            # The configuration names the sides of the picture that one gets.
+            # The configuration names the sides of the image that one gets.
             width, height = height, width
         self._camera: Any
         if Path(str(config.index_or_path)).is_file():
-            self._camera = FilmCamera(Path(str(config.index_or_path)))
+            self._camera = VideoCamera(Path(str(config.index_or_path)))
         else:
             inner = OpenCVCameraConfig(
                 index_or_path=config.index_or_path, fps=config.fps, width=width, height=height
             )
             self._camera = OpenCVCamera(inner)
-        self._gel = RunningGel()
+        self._gel = RunningBackground()
 
     @property
     def is_connected(self) -> bool:
@@ -51,7 +51,7 @@ class AnyTouchCamera(Camera):
         return [camera | {"type": "anytouch"} for camera in OpenCVCamera.find_cameras()]
 
     def connect(self, warmup: bool = True) -> None:
-        """Open the camera and read the picture of the untouched gel.
+        """Open the camera and read the image of the untouched gel.
 
         Without one it is estimated from the frames.
         """
@@ -61,14 +61,14 @@ class AnyTouchCamera(Camera):
         if self.config.rotate in (90, 270):
             self.width, self.height = self.height, self.width
         self.fps = self._camera.fps
-        self._gel = RunningGel()
+        self._gel = RunningBackground()
         if self.config.background:
-            self._gel.picture = decode(self.config.background)
+            self._gel.image = decode(self.config.background)
             self._gel.settled = True
         self._gel.add(np.array(self._camera.read()))
         self.__dict__.pop("_measure", None)  # that of an earlier connection has its gel
         if self.config.depth:
-            # What cannot be measured fails here, and the encoder is ready for the first picture.
+            # What cannot be measured fails here, and the encoder is ready for the first image.
             self.fields()
 
     def disconnect(self) -> None:
@@ -76,19 +76,19 @@ class AnyTouchCamera(Camera):
         self._camera.disconnect()
 
     def read(self, *settings: Any) -> np.ndarray:
-        """Return the next picture."""
+        """Return the next image."""
         return self._prepared(self._new(self._camera.read(*settings)))
 
     def async_read(self, timeout_ms: float = 200) -> np.ndarray:
-        """Return the newest picture that was not read yet. Raises TimeoutError."""
+        """Return the newest image that was not read yet. Raises TimeoutError."""
         return self._prepared(self._new(self._camera.async_read(timeout_ms=timeout_ms)))
 
     def read_latest(self, max_age_ms: int = 500) -> np.ndarray:
-        """Return the newest picture at once. Raises TimeoutError if it is older."""
+        """Return the newest image at once. Raises TimeoutError if it is older."""
         return self._prepared(self._camera.read_latest(max_age_ms=max_age_ms))
 
     def features(self, max_age_ms: int = 500) -> np.ndarray:
-        """Return the features f32 (E,) of the newest picture.
+        """Return the features f32 (E,) of the newest image.
 
         The encoder is loaded at the first call.
         """
@@ -96,7 +96,7 @@ class AnyTouchCamera(Camera):
         return np.asarray(self._encoder.encode_touch(self._ready(frame), self.config.sensor)[0])
 
     def fields(self, max_age_ms: int = 500) -> Fields:
-        """Return depth, shear, contact and force of the newest picture, as `Encoder.measure`."""
+        """Return depth, shear, contact and force of the newest image, as `Encoder.measure`."""
         return self._measured(self._newest(max_age_ms))
 
     def _newest(self, max_age_ms: int) -> np.ndarray:
@@ -119,7 +119,7 @@ class AnyTouchCamera(Camera):
         measure = encoder.measure_of(config.sensor, self._untouched(), config.width_mm)
         if measure.width_mm is None:
             raise ValueError(
-                f"nobody knows the mm that a picture of {config.sensor} shows: name width_mm"
+                f"nobody knows the mm that an image of {config.sensor} shows: name width_mm"
             )
         return measure, np.full(1, encoder.sensor_row(config.sensor), np.int32)
 
@@ -135,8 +135,8 @@ class AnyTouchCamera(Camera):
         return frame
 
     def _untouched(self) -> np.ndarray:
-        assert self._gel.picture is not None
-        return self._oriented(self._gel.picture)
+        assert self._gel.image is not None
+        return self._oriented(self._gel.image)
 
     def _prepared(self, frame: np.ndarray) -> np.ndarray:
         upright = self._oriented(frame)

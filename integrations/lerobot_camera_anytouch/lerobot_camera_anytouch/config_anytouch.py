@@ -13,11 +13,11 @@ from lerobot.cameras.configs import CameraConfig
 class AnyTouchCameraConfig(CameraConfig):
     """Settings of a tactile camera.
 
-    `width` and `height` are those of the oriented picture. `rotate` turns clockwise by degrees,
-    then `flip` mirrors. `background` is a picture of the untouched gel in the camera's own
-    orientation. `encoder` and `sensor` are for features and fields. With `depth`, pictures show the
-    depth in grey: 0 is none, and 255 is `white_mm` mm or more. `width_mm` is what the picture's
-    width shows, for a sensor that the encoder does not know. `index_or_path` may be a film, which
+    `width` and `height` are those of the oriented image. `rotate` turns clockwise by degrees,
+    then `flip` mirrors. `background` is an image of the untouched gel in the camera's own
+    orientation. `encoder` and `sensor` are for features and fields. With `depth`, images show the
+    depth in grey: 0 is none, and 255 is `white_mm` mm or more. `width_mm` is what the image's
+    width shows, for a sensor that the encoder does not know. `index_or_path` may be a video, which
     plays again and again.
     """
 

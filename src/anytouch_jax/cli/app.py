@@ -17,7 +17,7 @@ from difflib import get_close_matches
 from functools import partial
 from typing import Any, NamedTuple
 
-from anytouch_jax import __version__
+from anytouch_jax import __version__, renamed
 from anytouch_jax.cli.arguments import RENAMED, parse_options
 from anytouch_jax.doors import Door, enter, lacking
 from anytouch_jax.errors import CheckError, UserError, shorten
@@ -73,7 +73,7 @@ COMMANDS = {
     "data simulate": Command(
         "data:SimulateOptions",
         "data:run_simulate",
-        "Simulate touches felt by several sensors, with photographs, captions and forces.",
+        "Simulate touches felt by several sensors, with RGB images, captions and forces.",
     ),
     "data index": Command(
         "data:DatasetOptions",
@@ -110,7 +110,7 @@ COMMANDS = {
     "embed": Command(
         "embed:EmbedOptions",
         "embed:run",
-        "Embed a manifest, a folder of frames, a picture or a video: an .npz of features.",
+        "Embed a manifest, a folder of frames, an image or a video: an .npz of features.",
     ),
     "measure": Command(
         "measure:MeasureOptions",
@@ -137,6 +137,11 @@ COMMANDS = {
         "probe:run_benchmark",
         "Probe a public benchmark with the authors' settings.",
     ),
+    "finetune": Command(
+        "finetune:FinetuneOptions",
+        "finetune:run",
+        "Train the encoder and a head on your labels, in minutes.",
+    ),
     "retrieve": Command(
         "retrieve:RetrieveOptions",
         "retrieve:run_retrieve",
@@ -145,7 +150,7 @@ COMMANDS = {
     "sensor fit": Command(
         "sensor:FitOptions",
         "sensor:run_fit",
-        "Fit the look of your sensor to 5 to 50 pictures of it, for the simulator.",
+        "Fit the look of your sensor to 5 to 50 images of it, for the simulator.",
     ),
     "report": Command(
         "retrieve:ReportOptions",
@@ -216,7 +221,8 @@ def _run(command: Command, name: str, words: Sequence[str]) -> int:
     Raises UserError that names the extra of a package that is not installed.
     """
     try:
-        return command.run(command.parse(command.options, name, words))
+        today = renamed.words(words, lambda line: print(line, file=sys.stderr))
+        return command.run(command.parse(command.options, name, today))
     except ModuleNotFoundError as error:
         missing = error.name or ""
         # One of ours is a bug, and so is one that no extra brings.

@@ -23,7 +23,7 @@ from anytouch_jax.config.parsing import (
     Finite,
     NotNegative,
     Range,
-    Share,
+    Ratio,
     Threads,
 )
 from anytouch_jax.config.scenes import SceneOptions
@@ -45,7 +45,7 @@ class _OutputFolder:
 
 @dataclass(frozen=True)
 class SimulateOptions(SceneOptions, _OutputFolder):
-    """Simulate touches felt by several sensors, with photographs, captions, forces and slip.
+    """Simulate touches felt by several sensors, with RGB images, captions, forces and slip.
 
     Example: anytouch data simulate --out data/scenes --touches 400 --sensors gelsight_mini digit
     --seed 0
@@ -53,7 +53,7 @@ class SimulateOptions(SceneOptions, _OutputFolder):
     Run the same command again to continue after an interruption.
     """
 
-    threads: Threads = 2  # Threads that render photographs and write files.
+    threads: Threads = 2  # Threads that render RGB images and write files.
 
 
 def run_simulate(options: SimulateOptions) -> int:
@@ -154,7 +154,7 @@ class DatasetOptions:
     Datasets: touch_and_go, visgel, cloth, objectfolder_real, tvl, ssvtp, ycb_slide, octopi,
     tacquad, feel, objectfolder, real_touch, taxim_presses, gelsight_mini_pretrain, fota,
     tacbench_force, tacbench_pose, touchd_force, freetacman, webdataset, lerobot, bags, recordings.
-    Use recordings for your data: a folder of pictures for each recording, as
+    Use recordings for your data: a folder of images for each recording, as
     OBJECT/RECORDING/0.png. Put background.png, photo.jpg and caption.txt there or in a folder
     above.
     """
@@ -165,28 +165,28 @@ class DatasetOptions:
     out: Path | None = None
     # Keep your edits of the manifest OUT: columns, splits, texts and labels, matched by path.
     keep: bool = False
-    # Share of the objects or recordings in split val, for a dataset without splits.
-    val: Share = 0.05
-    # Share of the objects or recordings in split test, for a dataset without splits.
-    test: Share = 0.05
+    # Fraction of the objects or recordings in split val, for a dataset without splits.
+    val: Ratio = 0.05
+    # Fraction of the objects or recordings in split test, for a dataset without splits.
+    test: Ratio = 0.05
     lists: Path | None = None  # Folder of the dataset's list files, if they are not in ROOT.
     # touch_and_go: the task whose lists decide the split.
     task: Literal["material", "rough"] = "material"
     fold: NotNegative[int] = 0  # feel: the fold k whose split_<k>.npy decides the split.
-    # Let the reader write pictures into ROOT, for a dataset of arrays or videos.
+    # Let the reader write images into ROOT, for a dataset of arrays or videos.
     export: bool = False
     sensor: str | None = None
     """recordings, webdataset, lerobot, bags: the sensor, by its name in the configuration or a new
     name.
     """
     split_by: str | None = None
-    """recordings: what is held out: object, recording (a single picture is one), a column of the
+    """recordings: what is held out: object, recording (a single image is one), a column of the
     labels, or the part of the path in the parentheses of a pattern, as '(p[0-9]+)_'. Default:
-    object. For single pictures: recording.
+    object. For single images: recording.
     """
-    # recordings: every picture is a touch alone. By default names decide, and a few pictures.
+    # recordings: every image is a touch alone. By default names decide, and a few images.
     singles: bool = False
-    films: bool = False  # recordings: every folder of pictures is a film.
+    videos: bool = False  # recordings: every folder of images is a video.
     # recordings: order frames by their names, or by the times of the files.
     order: Literal["names", "times"] = "names"
     labels: Path | None = None
@@ -217,7 +217,7 @@ def run_index(options: DatasetOptions) -> int:
         options.name, options.root, options.out, options=settings, keep=options.keep
     )
     if report.written:
-        output.log(f"{report.written:,} pictures were written into {options.root}")
+        output.log(f"{report.written:,} images were written into {options.root}")
     print("\n".join(report.lines()))
     return 0
 
@@ -226,11 +226,11 @@ def run_index(options: DatasetOptions) -> int:
 class ContactOptions:
     """Mark the frames in contact by their difference from the untouched gel, without markers.
 
-    Example: anytouch data contact ycb_slide.parquet --drop --out ycb_touched.parquet --picture
+    Example: anytouch data contact ycb_slide.parquet --drop --out ycb_touched.parquet --image
     contact.png
 
     The manifest gets the columns label.contact_score and label.contact: 1, 0, or empty if unknown.
-    Pictures of the untouched gel that had to be estimated are stored next to it, as the
+    Images of the untouched gel that had to be estimated are stored next to it, as the
     background_path of their rows.
     """
 
@@ -241,26 +241,26 @@ class ContactOptions:
     threshold: NotNegative[tuple[tuple[str, float], ...]] = ()
     """Contact threshold of the score by sensor, as in: digit 5 gelsight 7."""
     background: tuple[str, ...] = ()
-    """Picture of the untouched gel for recordings without one: FILE for all, or UNIT=FILE for each
+    """Image of the untouched gel for recordings without one: FILE for all, or UNIT=FILE for each
     sensor unit.
     """
-    share: Share = 0.0
-    """Also require this share (0 to 1) of the highest score of the recording. This removes the
-    start and end of a contact. --picture and --check ignore it.
+    fraction: Ratio = 0.0
+    """Also require this fraction (0 to 1) of the highest score of the recording. This removes the
+    start and end of a contact. --image and --check ignore it.
     """
     # PNG of kept and dropped frames by score. Look at it before you trust a threshold.
-    picture: Path | None = None
+    image: Path | None = None
     # Print precision and recall against a reference column. Writes a manifest only with --out.
     check: bool = False
     # Column for --check (default: label.force, label.contact or label.contact_score).
     reference: str | None = None
     # Value of the reference column above which a frame is in contact.
     above: Finite[float | None] = None
-    threads: Threads = 2  # Threads that read pictures.
+    threads: Threads = 2  # Threads that read images.
 
 
 def run_contact(options: ContactOptions) -> int:
-    """Score every frame, then write the marked manifest, the picture, or the comparison with a
+    """Score every frame, then write the marked manifest, the image, or the comparison with a
     column.
     """
     import numpy as np
@@ -280,36 +280,36 @@ def run_contact(options: ContactOptions) -> int:
     )
     if target is not None:
         output.check_new(manifest, target)
-    output.check_apart(out=target, picture=options.picture)
-    if options.picture is not None:
-        frames = map(manifest.file, range(len(manifest))) if options.picture.exists() else ()
+    output.check_apart(out=target, image=options.image)
+    if options.image is not None:
+        frames = map(manifest.file, range(len(manifest))) if options.image.exists() else ()
         output.check_folder(
-            options.picture, "--picture", read=(*manifest.files, *frames), suffix=".png"
+            options.image, "--image", read=(*manifest.files, *frames), suffix=".png"
         )
     thresholds = dict(options.threshold)
     # raises for a mistake, before the work
-    contact.threshold_of_rows(manifest, thresholds, options.share)
+    contact.threshold_of_rows(manifest, thresholds, options.fraction)
     if options.check:
         contact.reference_contact(manifest, options.reference)
     if not np.isnan(contact.known_contact(manifest)).any() and not options.check:
         output.refuse_unused(
             options,
-            ("threshold", "share", "background"),
+            ("threshold", "fraction", "background"),
             "on rows that all have a label.contact, which is kept",
         )
     backgrounds = contact.read_backgrounds(manifest, options.background)
     scores = contact.contact_scores(manifest, backgrounds=backgrounds, workers=options.threads)
-    if target is not None and scores.gels:
+    if target is not None and scores.backgrounds:
         folder = target.with_name(f"{target.stem}_backgrounds")
         manifest = contact.store_backgrounds(manifest, scores, folder)
         output.log(
-            f"{folder}: {len(scores.gels)} pictures of the untouched gel, now the background_path "
-            "of their rows"
+            f"{folder}: {len(scores.backgrounds)} images of the untouched gel, now the "
+            "background_path of their rows"
         )
-    share = options.share
+    fraction = options.fraction
     drop = options.drop
     marked, report = contact.mark_contact(
-        manifest, scores, thresholds=thresholds, share=share, drop=drop
+        manifest, scores, thresholds=thresholds, fraction=fraction, drop=drop
     )
     print("\n".join(report.lines()))
     if options.check:
@@ -321,9 +321,9 @@ def run_contact(options: ContactOptions) -> int:
             thresholds=thresholds,
         )
         print("\n".join(quality.lines()))
-    if options.picture is not None:
-        picture = contact.contact_sheet(manifest, scores, options.picture, thresholds=thresholds)
-        output.log(f"{picture}: kept and dropped frames")
+    if options.image is not None:
+        image = contact.contact_sheet(manifest, scores, options.image, thresholds=thresholds)
+        output.log(f"{image}: kept and dropped frames")
     if target is not None:
         print(
             f"{output.write_new(marked, target)}: {len(marked):,} rows, with label.contact_score "
@@ -350,9 +350,9 @@ class VerifyOptions:
     """
     # Write a copy with rows that certainly allow commercial use, after --repair.
     commercial_only: Path | None = None
-    # With --repair: exchange touch image and photograph in these datasets. Look first.
+    # With --repair: exchange touch image and RGB image in these datasets. Look first.
     swap: tuple[str, ...] = ()
-    decode: bool = True  # Decode every picture. --no-decode only checks that the files exist.
+    decode: bool = True  # Decode every image. --no-decode only checks that the files exist.
     objects: bool = False  # Report an object in two splits as an error.
     threads: Threads = 4  # Threads that read files.
     out: Path | None = None  # Write the report as JSON too.
@@ -419,7 +419,7 @@ class AnnotateOptions:
     caption is missing.
     """
 
-    manifest: Positional[Path]  # Manifest with photographs or phrases (.csv, .parquet).
+    manifest: Positional[Path]  # Manifest with RGB images or phrases (.csv, .parquet).
     out: Path | None = None  # Manifest to write (default: NAME_captions, next to the manifest).
     # Folder that keeps every answer (default: NAME_answers, next to the manifest).
     answers: Path | None = None
@@ -439,15 +439,15 @@ class AnnotateOptions:
     """
     # Column that joins --captions and the manifest: caption_id, sequence, object, path, ...
     key: str | None = None
-    sheet: Path | None = None  # HTML page of captions with their pictures, to check by eye.
+    sheet: Path | None = None  # HTML page of captions with their images, to check by eye.
     sheet_count: Count[int] = 40  # Captions on that page.
     split: str | None = None  # Only rows of this split.
     family: tuple[tuple[str, Literal["photograph", "object", "phrase"]], ...] = ()
     """Prompt of your dataset, as in: mydata photograph."""
-    second_image: str = "image2_path"  # Column of a second photograph, for the prompt object.
+    second_image: str = "image2_path"  # Column of a second RGB image, for the prompt object.
     overwrite: bool = False  # Also ask for rows that have a caption.
     threads: Threads = 4  # Questions at a time.
-    # Longest side of the pictures that are sent, pixels.
+    # Longest side of the images that are sent, pixels.
     side: Annotated[int, Range(16, math.inf, "16 or more")] = 512
     timeout: Above0[float] = 60.0  # Seconds to wait for an answer.
     tries: Count[int] = 5  # Tries for a question.

@@ -1,4 +1,4 @@
-"""`anytouch embed`: features of a manifest, a folder of frames, a picture or a video."""
+"""`anytouch embed`: features of a manifest, a folder of frames, an image or a video."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 from anytouch_jax.cli.inputs import FrameOptions as FrameOptions
 from anytouch_jax.cli.inputs import FramesInput, Inputs, count_frames
 from anytouch_jax.cli.inputs import SensorOptions as SensorOptions
+from anytouch_jax.cli.inputs import backgrounds_of as backgrounds_of
 from anytouch_jax.cli.inputs import choose_gel as choose_gel
 from anytouch_jax.cli.inputs import contact_of_rows as contact_of_rows
 from anytouch_jax.cli.inputs import frames_input as frames_input
-from anytouch_jax.cli.inputs import gels_of as gels_of
 from anytouch_jax.cli.inputs import load_inputs as load_inputs
 from anytouch_jax.cli.inputs import log_if_cut as log_if_cut
 from anytouch_jax.cli.inputs import log_universal as log_universal
@@ -28,37 +28,37 @@ from anytouch_jax.progress import tracked
 if TYPE_CHECKING:
     import numpy as np
 
-    from anytouch_jax.data.background.rule import UnitGels
+    from anytouch_jax.data.background.rule import Backgrounds
     from anytouch_jax.data.manifest.manifest import Manifest
     from anytouch_jax.encoder.embed import Features, NumberedFrame
     from anytouch_jax.encoder.encoder import Encoder
-    from anytouch_jax.encoder.linear_head import LinearHead
+    from anytouch_jax.encoder.linear_head import Head
 
 
 @dataclass(frozen=True, kw_only=True)
 class EmbedOptions(FrameOptions):
-    """Embed a manifest, a folder of frames, a picture or a video. Writes an .npz of features.
+    """Embed a manifest, a folder of frames, an image or a video. Writes an .npz of features.
 
     Example: anytouch embed --data frames/ --sensor digit --out features.npz
     """
 
-    # Manifests (.csv, .parquet), or one folder of frames, stack (.npy, .npz), picture or video.
+    # Manifests (.csv, .parquet), or one folder of frames, stack (.npy, .npz), image or video.
     data: tuple[Path, ...]
     out: Path  # The .npz to write: features (n, d), rows (n,), key/* (n,).
     split: str | None = None  # Only this split of a manifest.
     batch: Count[int] = 64  # Frames at a time.
     on_bad_sample: Literal["error", "skip"] = "error"
-    """Stop at a row or picture that cannot be read, or skip it, count it and name the first."""
+    """Stop at a row or image that cannot be read, or skip it, count it and name the first."""
     # Also write the features into the LeRobot data set of the manifest, as this feature.
     column: str | None = None
 
 
 class _Rows(NamedTuple):
-    """Rows of a manifest, and pictures of the untouched gel if the encoder subtracts them."""
+    """Rows of a manifest, and images of the untouched gel if the encoder subtracts them."""
 
     manifest: Manifest
     rows: np.ndarray
-    gels: UnitGels | None
+    backgrounds: Backgrounds | None
 
 
 class _Work(NamedTuple):
@@ -111,24 +111,26 @@ def _resolve(options: EmbedOptions) -> _Work:
     inputs = load_inputs(options)
     if is_manifest:
         return _Work(options, inputs, _resolve_rows(options, inputs))
-    return _Work(options, inputs, frames_input(inputs.encoder, options, data, inputs.known_gels))
+    return _Work(
+        options, inputs, frames_input(inputs.encoder, options, data, inputs.known_backgrounds)
+    )
 
 
 def _resolve_rows(options: EmbedOptions, inputs: Inputs) -> _Rows:
     """Return the rows of manifests that can be embedded, and log the untouched gels."""
     import numpy as np
 
-    from anytouch_jax.data.background.rule import UnitGels
+    from anytouch_jax.data.background.rule import Backgrounds
     from anytouch_jax.data.manifest import manifest as manifests
 
     manifest = manifests.read(options.data)
     rows = np.arange(len(manifest)) if options.split is None else manifest.rows_of(options.split)
     rows = usable_rows(manifest, rows, options.frames)
-    gels = None
+    backgrounds = None
     if inputs.encoder.subtracts:
-        gels = UnitGels(manifest, inputs.known_gels, log)
-        log(gels.report(rows))
-    return _Rows(manifest, rows, gels)
+        backgrounds = Backgrounds(manifest, inputs.known_backgrounds, log)
+        log(backgrounds.report(rows))
+    return _Rows(manifest, rows, backgrounds)
 
 
 def _embed_rows(work: _Work, source: _Rows) -> Features:
@@ -142,12 +144,17 @@ def _embed_rows(work: _Work, source: _Rows) -> Features:
     settings = embedding.RowSettings(
         frames=options.frames,
         pooling=work.inputs.pooling,
-        join=options.join,
+        aggregation=options.aggregation,
         batch=options.batch,
         on_bad_sample=options.on_bad_sample,
     )
     rows, values = embedding.embed_with(
-        work.inputs.encoder, manifest, source.rows, settings, gels=source.gels, log=log
+        work.inputs.encoder,
+        manifest,
+        source.rows,
+        settings,
+        backgrounds=source.backgrounds,
+        log=log,
     )
     keys = {
         name: manifest.text_column(name)[rows] for name in ("path", "sensor", "sequence", "split")
@@ -158,11 +165,11 @@ def _embed_rows(work: _Work, source: _Rows) -> Features:
         if name in others or name.startswith("label."):
             keys[name] = embedding.plain_column(manifest, name)[rows]
     predictions = {}
-    if options.head is not None:
-        predictions["contact"] = contact_of_rows(manifest, rows, source.gels)
-    pictures = {} if source.gels is None else source.gels.pictures(rows)
+    if work.inputs.head is not None:
+        predictions["contact"] = contact_of_rows(manifest, rows, source.backgrounds)
+    images = {} if source.backgrounds is None else source.backgrounds.images(rows)
     skipped = len(source.rows) - len(rows)
-    return embedding.Features(values, rows, keys, skipped, predictions, pictures)
+    return embedding.Features(values, rows, keys, skipped, predictions, images)
 
 
 def _embed_frames(work: _Work, source: FramesInput) -> Features:
@@ -188,14 +195,14 @@ def _embed_frames(work: _Work, source: FramesInput) -> Features:
         source.preprocess,
         length=options.frames,
         pooling=work.inputs.pooling,
-        join=options.join,
+        aggregation=options.aggregation,
         batch=options.batch,
     )
     features.predictions["contact"] = np.asarray(contact)[features.rows]
     if times:
         log_if_cut(data, len(times))
         features.keys["time"] = np.asarray(times)[features.rows]
-    features.gels.update(gels_of(source.preprocess, options))
+    features.backgrounds.update(backgrounds_of(source.preprocess, options))
     return features
 
 
@@ -203,7 +210,7 @@ def save_features(
     out: Path,
     encoder: Encoder,
     features: Features,
-    head: LinearHead | None,
+    head: Head | None,
     options: FrameOptions,
     about: dict[str, str],
 ) -> None:
@@ -220,7 +227,7 @@ def save_features(
     from anytouch_jax.encoder.embed import save_npz
 
     if head is not None and len(features.values):
-        predictions = features.predictions | _predictions(head, features.values)
+        predictions = features.predictions | head.predictions(features.values)
         features = replace(features, predictions=predictions)
         named = None if options.sensor is None else options.sensor_name
         _log_other_sensors(head, features, named)
@@ -229,10 +236,12 @@ def save_features(
         "weights": encoder.fingerprint,
         "dtype": encoder.config.model.dtype,
     }
-    save_npz(out, features, about | {"frames": str(options.frames), "join": options.join})
+    save_npz(
+        out, features, about | {"frames": str(options.frames), "aggregation": options.aggregation}
+    )
 
 
-def _log_other_sensors(head: LinearHead, features: Features, named: str | None) -> None:
+def _log_other_sensors(head: Head, features: Features, named: str | None) -> None:
     """Log if features look like another sensor than the one named, or that of their rows."""
     calibration = head.calibration
     if calibration is None:
@@ -247,25 +256,6 @@ def _log_other_sensors(head: LinearHead, features: Features, named: str | None) 
         warning = calibration.sensor_warning(head.scaled(values), name)
         if warning:
             log(warning)
-
-
-def _predictions(head: LinearHead, values: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the arrays that a head adds to features.
-
-    These are label and p, and of a calibrated head set, classes and novelty.
-    """
-    if head.calibration is None:
-        label, p = head(values)
-        return {"label": label, "p": p.max(1)}
-    assessed = head.assess(values)
-    return {
-        "label": assessed.label,
-        "p": assessed.p.max(1),
-        "set": assessed.in_set,
-        "classes": head.classes,
-        "novelty": assessed.novelty,
-        "novel": assessed.novel,
-    }
 
 
 def _write_columns(root: Path, column: str, features: Features) -> None:

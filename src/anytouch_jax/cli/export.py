@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from anytouch_jax.cli.output import check_folder, log, refuse_join, refuse_unused
 from anytouch_jax.config import UNIVERSAL, ModelConfig, to_json
-from anytouch_jax.config.parsing import Count, Share
+from anytouch_jax.config.parsing import Count, Ratio
 from anytouch_jax.errors import UserError
 
 if TYPE_CHECKING:
     import numpy as np
 
     from anytouch_jax.encoder.encoder import Encoder
+    from anytouch_jax.encoder.linear_head import Head
     from anytouch_jax.weights.safetensors import Loaded
 
 _INT8 = ("int8", "data", "fields")
@@ -69,15 +70,17 @@ class ExportOptions:
     frames: Count[int] = 1
     # jax: the platforms it runs on.
     platforms: tuple[Literal["cpu", "cuda", "rocm", "tpu"], ...] = ("cpu", "cuda")
-    # jax, onnx: class token, mean of patch tokens, or both.
-    pooling: Literal["class", "mean", "both"] = "class"
+    pooling: Literal["class", "mean", "both"] | None = None
+    """jax, onnx: class token, mean of patch tokens, or both (default: that of the head of MODEL,
+    else class).
+    """
     # jax: how the segments of a long clip are joined.
-    join: Literal["mean", "sum", "concat"] = "mean"
+    aggregation: Literal["mean", "sum", "concat"] = "mean"
     dtype: Literal["trained", "float32", "bfloat16"] = "trained"
     """jax: arithmetic of training, or another. Use bfloat16 on GPUs and CPUs with AMX."""
     # Weights: the run or file that MODEL was trained from, to interpolate between the two.
     between: Path | None = None
-    share: Share = 0.5  # Weights: position from BETWEEN (0) to MODEL (1).
+    fraction: Ratio = 0.5  # Weights: position from BETWEEN (0) to MODEL (1).
 
 
 def run(options: ExportOptions) -> int:
@@ -89,7 +92,7 @@ def run(options: ExportOptions) -> int:
         raise UserError("Name the file to write with --out, or a folder to upload with --card.")
     if options.to in ("jax", "onnx"):
         return _export_encoder(options, options.out)
-    unused = ("frames", "platforms", "pooling", "join", "dtype", *_INT8)
+    unused = ("frames", "platforms", "pooling", "aggregation", "dtype", *_INT8)
     refuse_unused(options, unused, f"with --to {options.to}")
     return _export_weights(options, options.out)
 
@@ -97,14 +100,15 @@ def run(options: ExportOptions) -> int:
 def _export_encoder(options: ExportOptions, out: Path) -> int:
     """Write the touch encoder as a program, for jax or as ONNX."""
     is_onnx = options.to == "onnx"
-    foreign = ("platforms", "join", "dtype") if is_onnx else _INT8
-    refuse_unused(options, ("between", "share", *foreign), f"with --to {options.to}")
+    foreign = ("platforms", "aggregation", "dtype") if is_onnx else _INT8
+    refuse_unused(options, ("between", "fraction", *foreign), f"with --to {options.to}")
     if options.int8 != bool(options.data):
         raise UserError(
             "--int8 is calibrated on the touches of manifests: give both --int8 and --data, or "
             "neither."
         )
     from anytouch_jax.encoder.encoder import load_encoder
+    from anytouch_jax.encoder.linear_head import HEAD, save_head
     from anytouch_jax.export import export as exports
     from anytouch_jax.train.mesh import enable_compilation_cache
 
@@ -112,17 +116,18 @@ def _export_encoder(options: ExportOptions, out: Path) -> int:
     enable_compilation_cache()
     encoder = load_encoder(options.model).computed_in("float32" if is_onnx else options.dtype)
     refuse_join(options, encoder.config.model.frames)
+    head = _own_head(options)
     settings = exports.ExportSettings(
         form="onnx" if is_onnx else "jax",
         frames=options.frames,
         platforms=options.platforms,
-        pooling=options.pooling,
-        join=options.join,
+        pooling=options.pooling or ("class" if head is None else head.pooling),
+        aggregation=options.aggregation,
         fields=options.fields,
     )
     if options.int8:
-        touches, gels = _calibration(encoder, options)
-        settings = replace(settings, calibration=touches, gels=gels)
+        touches, backgrounds = _calibration(encoder, options)
+        settings = replace(settings, calibration=touches, backgrounds=backgrounds)
     about = exports.export_with(encoder, out, settings)
     print(
         f"{out}: {about['bytes'] / 1e6:.1f} MB for {', '.join(about['platforms'])}; "
@@ -139,28 +144,47 @@ def _export_encoder(options: ExportOptions, out: Path) -> int:
             f"on {measured['touches']} touches"
         )
     print(f"{exports.describes(out)}: how to call it")
+    if head is not None:
+        beside = out.with_suffix(f".{HEAD}")
+        save_head(beside, head)
+        print(f"{beside}: its head for {head.label}, which at.load_head reads")
     return 0
+
+
+def _own_head(options: ExportOptions) -> Head | None:
+    """Return the head of `anytouch finetune` that reads the exported features, None without one."""
+    from anytouch_jax.cli.inputs import head_in_use
+
+    def misfit(head: Head) -> str:
+        wrong = []
+        if options.pooling not in (None, head.pooling):
+            wrong.append(f"--pooling {head.pooling}")
+        if options.frames != head.frames:
+            wrong.append(f"--frames {head.frames}")
+        return " ".join(wrong)
+
+    return head_in_use(options.model, None, misfit)
 
 
 def _calibration(
     encoder: Encoder, options: ExportOptions
 ) -> tuple[tuple[np.ndarray, np.ndarray], dict[str, np.ndarray] | None]:
-    """Return the touches that int8 is calibrated on, and pictures of their untouched gels.
+    """Return the touches that int8 is calibrated on, and images of their untouched gels.
 
     Touches are u8 (200, T, H, W, 3), evenly spaced over the rows, with sensor rows i32 (200,).
     """
     import numpy as np
 
     from anytouch_jax.cli.inputs import usable_rows
-    from anytouch_jax.data.background.rule import UnitGels
+    from anytouch_jax.data.background.rule import Backgrounds
     from anytouch_jax.data.manifest import manifest as manifests
     from anytouch_jax.encoder.embed import RowSettings, embed_with, rows_with_gel
     from anytouch_jax.export.engines import CALIBRATION
 
     manifest = manifests.read(options.data)
-    gels = UnitGels(manifest)
+    backgrounds = Backgrounds(manifest)
     rows = usable_rows(manifest, np.arange(len(manifest)), options.frames)
-    rows = rows_with_gel(encoder, gels, rows, log)
+    rows = rows_with_gel(encoder, backgrounds, rows, log)
     if len(rows) < CALIBRATION:
         raise UserError(
             f"--int8 needs {CALIBRATION} touches and --data has {len(rows)}. Name more manifests."
@@ -174,12 +198,12 @@ def _calibration(
 
     # The touches are those that `embed` would encode, prepared and background-subtracted.
     settings = RowSettings(frames=options.frames, edit=keep)
-    given, _ = embed_with(encoder, manifest, rows, settings, gels=gels, log=log)
+    given, _ = embed_with(encoder, manifest, rows, settings, backgrounds=backgrounds, log=log)
     sensors = manifest.text_column("sensor")[given]
     # `embed_with` has logged unknown sensors already.
     ids = np.array([encoder.sensor_row(name, lambda _: None) for name in sensors], np.int32)
-    pictures = gels.pictures(given) if encoder.subtracts else None
-    return (np.concatenate(clips), ids), pictures
+    images = backgrounds.images(given) if encoder.subtracts else None
+    return (np.concatenate(clips), ids), images
 
 
 def _export_card(options: ExportOptions, folder: Path) -> int:
@@ -192,10 +216,10 @@ def _export_card(options: ExportOptions, folder: Path) -> int:
         "frames",
         "platforms",
         "pooling",
-        "join",
+        "aggregation",
         "dtype",
         "between",
-        "share",
+        "fraction",
         "out",
         *_INT8,
     )
@@ -218,7 +242,7 @@ def _export_weights(options: ExportOptions, out: Path) -> int:
     from anytouch_jax.weights import load, safetensors
 
     if options.between is None:
-        refuse_unused(options, ("share",), "without --between")
+        refuse_unused(options, ("fraction",), "without --between")
     read = [path for path in (options.model, options.between) if path and not path.is_dir()]
     check_folder(out, read=read, suffix=".safetensors")
     loaded = load.load_model(options.model, stored_rows=True)
@@ -226,7 +250,9 @@ def _export_weights(options: ExportOptions, out: Path) -> int:
     about = loaded.export_metadata()
     if options.between is not None:
         params = _interpolated(options, options.between, loaded)
-        about["source"] = f"{options.share:g} of the way from {options.between} to {options.model}"
+        about["source"] = (
+            f"{options.fraction:g} of the way from {options.between} to {options.model}"
+        )
     if options.to == "release":
         _write_release(options, out, params, loaded.config.model, about)
     else:
@@ -257,7 +283,7 @@ def _interpolated(options: ExportOptions, before: Path, loaded: Loaded) -> dict[
             f"{before} and {options.model} have different networks ({', '.join(differ)}). "
             "--between takes the run that MODEL was trained from."
         )
-    return tree.interpolate(other.params, loaded.params, options.share)
+    return tree.interpolate(other.params, loaded.params, options.fraction)
 
 
 def _write_release(

@@ -25,7 +25,7 @@ _WEIGHTS = (".safetensors", ".pth", ".pt", ".ckpt", ".bin", ".npz")
 
 @dataclass(frozen=True)
 class InfoOptions:
-    """Describe an encoder by name, a run, weights, a manifest, features, a head, pictures, a film,
+    """Describe an encoder by name, a run, weights, a manifest, features, a head, images, a video,
     or the cameras.
 
     Example: anytouch info runs/stage2 data/scenes/manifest.parquet features.npz
@@ -37,7 +37,7 @@ class InfoOptions:
     paths: Positional[tuple[Path, ...]]  # Files, folders and names of encoders.
     # Check every sensor unit of a manifest, and print a verdict and what to do.
     health: bool = False
-    picture: Path | None = None  # PNG with a picture and the verdict of each unit, with --health.
+    image: Path | None = None  # PNG with an image and the verdict of each unit, with --health.
     # Does this encoder see contact? With --health, on rows with contact or background.
     model: Path | None = None
 
@@ -46,7 +46,7 @@ def run(options: InfoOptions) -> int:
     """Print some lines about every path."""
     if options.health:
         return _health(options)
-    refuse_unused(options, ("picture", "model"), "without --health")
+    refuse_unused(options, ("image", "model"), "without --health")
     for number, path in enumerate(options.paths):
         lines = "\n".join(_lines(path)).split("\n")
         print("\n" * bool(number) + "\n".join(map(shorten, lines)))
@@ -62,15 +62,15 @@ def _health(options: InfoOptions) -> int:
     from anytouch_jax.evaluate.tables import markdown_table
     from anytouch_jax.live import health
 
-    check_folder(options.picture, "--picture", read=options.paths, suffix=".png")
+    check_folder(options.image, "--image", read=options.paths, suffix=".png")
     table = manifests.read(options.paths)
     units = list(health.read_units(table))
     if not units:
         raise UserError(
-            "No picture of a sensor can be read. Check the manifest with `anytouch data verify`."
+            "No image of a sensor can be read. Check the manifest with `anytouch data verify`."
         )
     results = health.check_units(
-        units, {unit.sensor: health.known_gels(unit.sensor) for unit in units}
+        units, {unit.sensor: health.known_backgrounds(unit.sensor) for unit in units}
     )
     if options.model is not None:
         results = [_seen_by(options.model, table, unit) for unit in results]
@@ -86,9 +86,9 @@ def _health(options: InfoOptions) -> int:
             for name, value, advice in rows
         ]
         print_table(markdown_table(("check", "value", "what to do"), cells))
-    if options.picture is not None:
-        health.health_sheet(results, options.picture)
-        log(f"{options.picture}: a picture of each unit")
+    if options.image is not None:
+        health.health_sheet(results, options.image)
+        log(f"{options.image}: an image of each unit")
     faulty = sum(bool(unit.faults) for unit in results)
     print(f"\n{len(results) - faulty} of {len(results)} units are good")
     return int(faulty > 0)
@@ -170,44 +170,44 @@ def _lines(path: Path) -> list[str]:
         return lines
     if suffix in _WEIGHTS or path.name.endswith(".index.json"):
         return _weights(path, weights)
-    if lines := _pictures(path):
+    if lines := _images(path):
         return lines
     known = (
         f"a run folder, weights ({', '.join(_WEIGHTS)}), a manifest ({', '.join(_TABLES)}), "
         "features, a head"
     )
-    raise UserError(f"{path} has no known format. Known are {known}, pictures and films.")
+    raise UserError(f"{path} has no known format. Known are {known}, images and videos.")
 
 
-def _pictures(path: Path) -> list[str]:
-    """Return lines about a picture, a folder of pictures or a film, [] for anything else."""
+def _images(path: Path) -> list[str]:
+    """Return lines about an image, a folder of images or a video, [] for anything else."""
     import cv2
 
     from anytouch_jax.data import images
     from anytouch_jax.live.cameras import format_of
 
     use = "use it with embed and view"
-    if (files := images.picture_files(path)) is not None:
+    if (files := images.image_files(path)) is not None:
         height, width = images.decode(files[0]).shape[:2]
-        what = f"a folder of {len(files)} pictures" if path.is_dir() else "a picture"
+        what = f"a folder of {len(files)} images" if path.is_dir() else "an image"
         return [f"{path}: {what} of {width} x {height} pixels", use]
-    film = images.open_video(path)
+    video = images.open_video(path)
     names = (
         cv2.CAP_PROP_FRAME_COUNT,
         cv2.CAP_PROP_FRAME_WIDTH,
         cv2.CAP_PROP_FRAME_HEIGHT,
         cv2.CAP_PROP_FPS,
     )
-    count, wide, high, rate = (film.get(name) for name in names)
-    codec = format_of(film)
-    is_film = film.isOpened() and film.read()[0]
-    film.release()
-    if not is_film:
+    count, wide, high, rate = (video.get(name) for name in names)
+    codec = format_of(video)
+    is_video = video.isOpened() and video.read()[0]
+    video.release()
+    if not is_video:
         return []
     frames = f"{count:.0f} frames" if count > 0 else "an unknown number of frames"
     seconds = f", {count / rate:.1f} s at {rate:.4g} frames/s" if rate > 0 and count > 0 else ""
     about = f"{wide:.0f} x {high:.0f} pixels, codec {codec or 'unknown'}"
-    return [f"{path}: a film of {frames}{seconds}, {about}", f"{use}, and with stream"]
+    return [f"{path}: a video of {frames}{seconds}, {about}", f"{use}, and with stream"]
 
 
 def _named(name: str) -> str:
@@ -240,7 +240,7 @@ def _folder(path: Path) -> list[str]:
         )
         if is_run:
             return _run(path)
-        return _pictures(path)
+        return _images(path)
     others = ", ".join(sorted(file.name for file in tables[1:]))
     return [
         *_manifest(tables[0]),
@@ -388,12 +388,15 @@ def _arrays(path: Path) -> list[str]:
         )
     except (OSError, ValueError) as error:
         raise UserError(f"{path} is not a whole .npz file of plain arrays: {error}.") from None
-    if {"format", "mark", "classes"} <= arrays.keys():
-        from anytouch_jax.encoder.linear_head import load_head
+    if {"format", "mark"} <= arrays.keys():
+        from anytouch_jax.encoder.linear_head import LinearHead, load_head
 
         head = load_head(path)
+        what = "a number"
+        if isinstance(head, LinearHead):
+            what = ", ".join(head.classes)
         return [
-            f"{path}: a linear head for {head.label}: {', '.join(head.classes)}",
+            f"{path}: a linear head for {head.label}: {what}",
             f"for features of {len(head.mean)} with --pooling {head.pooling} --frames "
             f"{head.frames}, encoder {head.fingerprint}",
             *(head.promises() or ["without calibration: save it again"]),

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -17,13 +18,13 @@ from anytouch_jax.errors import UserError
 if TYPE_CHECKING:
     import numpy as np
 
-    from anytouch_jax.data.background.rule import UnitGels
+    from anytouch_jax.data.background.rule import Backgrounds
     from anytouch_jax.data.manifest.manifest import Manifest
     from anytouch_jax.encoder.contact_gate import ContactGate
     from anytouch_jax.encoder.embed import NumberedFrame
     from anytouch_jax.encoder.encoder import Encoder
     from anytouch_jax.encoder.interface import Preprocess
-    from anytouch_jax.encoder.linear_head import LinearHead
+    from anytouch_jax.encoder.linear_head import Head
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +37,7 @@ class SensorOptions:
     """Sensor of the frames: a name, or a folder NAME.sensor of `anytouch sensor fit`. Without it,
     or if it is unknown, the universal tokens are used.
     """
-    # Picture of the untouched gel: it is subtracted, and decides contact.
+    # Image of the untouched gel: it is subtracted, and decides contact.
     background: Path | None = None
     # Turn the frames clockwise by so many degrees, before anything else.
     rotate: Literal[0, 90, 180, 270] = 0
@@ -63,7 +64,8 @@ class FrameOptions(SensorOptions):
     """Features: the class token, the mean of the patch tokens, or both (default: that of --head,
     else class).
     """
-    join: Literal["mean", "sum", "concat"] = "mean"  # How the segments of a long clip are joined.
+    aggregation: Literal["mean", "sum", "concat"] = "mean"
+    """How the segments of a long clip are joined."""
     dtype: Literal["trained", "float32", "bfloat16"] = "trained"
     """Arithmetic: that of training, or another. Use bfloat16 on GPUs and CPUs with AMX."""
     engine: Literal["auto", "xla", "onnxruntime", "openvino"] = "auto"
@@ -72,12 +74,13 @@ class FrameOptions(SensorOptions):
     """
     head: Path | None = None
     """Also predict the class with this head of `anytouch probe label --save`: its label,
-    probability p, conformal set and whether the touch is novel.
+    probability p, conformal set and whether the touch is novel (default: that of --model, if
+    `anytouch finetune` made it).
     """
 
 
 def takes_manifest(options: SensorOptions, data: Sequence[Path], of_rows: Sequence[str]) -> bool:
-    """Return whether --data names manifests; else it is one folder, picture or video.
+    """Return whether --data names manifests; else it is one folder, image or video.
 
     Args:
         options: those of the command.
@@ -144,12 +147,12 @@ class Inputs(NamedTuple):
 
     encoder: Encoder
     pooling: Literal["class", "mean", "both"]
-    head: LinearHead | None
+    head: Head | None
 
     @property
-    def known_gels(self) -> dict[str, np.ndarray]:
-        """Pictures of the untouched gel that the head, or an exported encoder, was fitted with."""
-        return self.encoder.gels if self.head is None else self.head.gels
+    def known_backgrounds(self) -> dict[str, np.ndarray]:
+        """Images of the untouched gel that the head, or an exported encoder, was fitted with."""
+        return self.encoder.backgrounds if self.head is None else self.head.backgrounds
 
 
 def load_inputs(options: FrameOptions) -> Inputs:
@@ -158,13 +161,12 @@ def load_inputs(options: FrameOptions) -> Inputs:
     Raises UserError if they do not fit.
     """
     from anytouch_jax.encoder.encoder import check_frames, load_encoder
-    from anytouch_jax.encoder.linear_head import load_head
     from anytouch_jax.encoder.sensor_words import resolve_sensor
     from anytouch_jax.train.mesh import enable_compilation_cache
 
     check_sensor(options)
     word = resolve_sensor(options.sensor or UNIVERSAL)
-    head = None if options.head is None else load_head(options.head)
+    head = head_in_use(options.model, options.head, partial(_fits, options))
     pooling = options.pooling
     if pooling is None:
         pooling = "class" if head is None else head.pooling
@@ -177,8 +179,52 @@ def load_inputs(options: FrameOptions) -> Inputs:
     check_frames(encoder.config.model, options.frames)
     refuse_join(options, encoder.config.model.frames)
     if head is not None:
-        head.check(encoder.source, encoder.fingerprint, pooling, options.frames, options.join)
+        head.check(
+            encoder.source, encoder.fingerprint, pooling, options.frames, options.aggregation
+        )
     return Inputs(encoder, pooling, head)
+
+
+def head_in_use(
+    model: Path, named: Path | None, misfit: Callable[[Head], str] = lambda head: ""
+) -> Head | None:
+    """Return the head that a user named, else that which lies with the encoder.
+
+    Args:
+        model: the encoder.
+        named: the head of --head.
+        misfit: returns the options that the encoder's own head needs, "" if it fits. Else it is
+            left out, which is logged.
+    """
+    from anytouch_jax.encoder.linear_head import find_head, load_head
+    from anytouch_jax.weights import registry
+
+    if named is not None:
+        return load_head(named)
+    if str(model).startswith("hf:"):  # `load_encoder` downloads it
+        return None
+    own = find_head(registry.locate(model))
+    if own is None:
+        return None
+    head = load_head(own)
+    needs = misfit(head)
+    if needs:
+        log(f"the head of {model} is not used: it needs {needs}")
+        return None
+    log(f"head: {own}, for {head.label}")
+    return head
+
+
+def _fits(options: FrameOptions, head: Head) -> str:
+    """Return the options that a head needs and does not have, "" if it fits."""
+    wrong = []
+    if options.pooling not in (None, head.pooling):
+        wrong.append(f"--pooling {head.pooling}")
+    if options.frames != head.frames:
+        wrong.append(f"--frames {head.frames}")
+    if options.aggregation != "mean":
+        wrong.append("--aggregation mean")
+    return " ".join(wrong)
 
 
 class FramesInput(NamedTuple):
@@ -195,7 +241,7 @@ def frames_input(
 ) -> FramesInput:
     """Return how the frames of `data` are prepared, and log the untouched gel.
 
-    `known` are pictures of the untouched gel that a head was fitted with.
+    `known` are images of the untouched gel that a head was fitted with.
     """
     from anytouch_jax.data.background.rule import as_taken
     from anytouch_jax.encoder.contact_gate import ContactGate
@@ -208,11 +254,11 @@ def frames_input(
             "--background only decides contact: this encoder was trained on frames without "
             "background subtraction"
         )
-    # Pictures of a head are upright, and the camera's may not be.
+    # Images of a head are upright, and the camera's may not be.
     known = {name: as_taken(gel, options.rotate, options.flip) for name, gel in known.items()}
-    picture, background = choose_gel(encoder, options.background, data, known)
+    image, background = choose_gel(encoder, options.background, data, known)
     preprocess = Preprocess(
-        encoder, picture, rotate=options.rotate, flip=options.flip, known=known, log=log
+        encoder, image, rotate=options.rotate, flip=options.flip, known=known, log=log
     )
     about = {
         "background": background,
@@ -230,9 +276,9 @@ def choose_gel(
     known: Mapping[str, np.ndarray],
     of: str = "the head was fitted with",
 ) -> tuple[np.ndarray | None, str]:
-    """Return the untouched gel of a folder, a video, a picture or a camera, and what it is.
+    """Return the untouched gel of a folder, a video, an image or a camera, and what it is.
 
-    What it is is logged, too. It is the picture that the user named, that of the same unit among
+    What it is is logged, too. It is the image that the user named, that of the same unit among
     the `known` ones, that of the folder, or the median of the frames. It is None for a camera, and
     for an encoder that does without.
 
@@ -240,8 +286,8 @@ def choose_gel(
         encoder: what it is for.
         named: the file that the user named.
         data: where the frames are.
-        known: pictures of units that a head was fitted with.
-        of: what the known pictures belong to, in words.
+        known: images of units that a head was fitted with.
+        of: what the known images belong to, in words.
 
     Raises:
         UserError: there are too few frames.
@@ -250,29 +296,29 @@ def choose_gel(
 
     stored = list_images(data)[1].get(BACKGROUND) if data.is_dir() else None
     file = named
-    # A picture that lies beside the frames counts less than one of a head, see `rule`.
+    # An image that lies beside the frames counts less than one of a head, see `rule`.
     if file is None and not (known and encoder.subtracts):
         file = stored
-    picture: np.ndarray | None = None
+    image: np.ndarray | None = None
     if file is not None:
-        picture = decode(file)
+        image = decode(file)
         what = str(file)
     elif not encoder.subtracts:
         return None, "not subtracted"
     elif data.exists():
-        picture, what = _recording_gel(encoder, data, stored, known, of)
+        image, what = _recording_gel(encoder, data, stored, known, of)
     else:
         what = _live_gel(encoder, known)
-    if not encoder.subtracts:  # the picture decides contact
-        return picture, "not subtracted"
+    if not encoder.subtracts:  # the image decides contact
+        return image, "not subtracted"
     log(f"untouched gel: {what}")
-    return picture, what
+    return image, what
 
 
 def _live_gel(encoder: Encoder, known: Mapping[str, np.ndarray]) -> str:
     """Return what the untouched gel of a camera will be: `Preprocess` chooses it at run time."""
     if known:
-        return "a picture of the head, or a running estimate"
+        return "an image of the head, or a running estimate"
     if encoder.needs_background:
         return "a running estimate"
     return "not subtracted"
@@ -281,7 +327,7 @@ def _live_gel(encoder: Encoder, known: Mapping[str, np.ndarray]) -> str:
 def _recording_gel(
     encoder: Encoder, data: Path, stored: Path | None, known: Mapping[str, np.ndarray], of: str
 ) -> tuple[np.ndarray | None, str]:
-    """Return the untouched gel of a folder, a video or a picture, and what it is."""
+    """Return the untouched gel of a folder, a video or an image, and what it is."""
     from anytouch_jax.data.background import rule
     from anytouch_jax.data.images import decode
 
@@ -296,21 +342,21 @@ def _recording_gel(
     counts = rule.recognise(known, own, is_background=is_sure, untouched=stored is not None, of=of)
     if counts.warning:
         log(counts.warning)
-    if counts.picture is not None:
-        return counts.picture, counts.what
+    if counts.image is not None:
+        return counts.image, counts.what
     if is_sure:
         return own, what
     if encoder.needs_background:
         raise UserError(
             f"{data} has too few frames to estimate the untouched gel, which is subtracted. Give "
-            f"{rule.FEWEST} or more, or a picture of the gel with nothing on it: --background, or "
+            f"{rule.FEWEST} or more, or an image of the gel with nothing on it: --background, or "
             "background.png next to the frames."
         )
     return None, "not subtracted"
 
 
 def _some_frames(data: Path) -> Iterator[np.ndarray]:
-    """Yield evenly spread frames of a folder, all frames of a video, or a picture.
+    """Yield evenly spread frames of a folder, all frames of a video, or an image.
 
     Broken ones are left out.
     """
@@ -321,7 +367,7 @@ def _some_frames(data: Path) -> Iterator[np.ndarray]:
     if stack is not None:
         yield from stacks.stacked_frames(stack[:: -(-len(stack) // FRAMES)], data)
         return
-    files = images.picture_files(data)
+    files = images.image_files(data)
     if files is None:
         yield from images.frames_from_video(data)
         return
@@ -330,7 +376,7 @@ def _some_frames(data: Path) -> Iterator[np.ndarray]:
             yield images.decode(file)
 
 
-def gels_of(preprocess: Preprocess, options: SensorOptions) -> dict[str, np.ndarray]:
+def backgrounds_of(preprocess: Preprocess, options: SensorOptions) -> dict[str, np.ndarray]:
     """Return the untouched gel that was subtracted, upright, by the name of the sensor."""
     from anytouch_jax.data.background.rule import reduced
     from anytouch_jax.data.transforms import orient_frame
@@ -384,24 +430,26 @@ def usable_rows(manifest: Manifest, rows: np.ndarray, frames: int) -> np.ndarray
 
 
 def contact_of_rows(
-    manifest: Manifest, rows: np.ndarray, gels: UnitGels | None = None
+    manifest: Manifest, rows: np.ndarray, backgrounds: Backgrounds | None = None
 ) -> np.ndarray:
     """Return the contact of `rows` (n,): label.contact, or by the untouched gel; NaN if unknown."""
     import numpy as np
 
     from anytouch_jax.data.background import contact
-    from anytouch_jax.data.background.rule import UnitGels
+    from anytouch_jax.data.background.rule import Backgrounds
 
     known = contact.known_contact(manifest)[rows]
     limits = contact.threshold_of_rows(manifest, None, 0.0)[rows]
     unknown = rows[np.isnan(known)]
-    score = contact.contact_scores(manifest, unknown, gels=gels or UnitGels(manifest)).score[rows]
+    score = contact.contact_scores(
+        manifest, unknown, served=backgrounds or Backgrounds(manifest)
+    ).score[rows]
     by_score = np.where(np.isnan(score), np.nan, score > limits)
     return np.where(np.isnan(known), by_score, known)
 
 
 def count_frames(data: Path) -> int:
-    """Return the number of frames of a folder, a stack, a picture or a video's header."""
+    """Return the number of frames of a folder, a stack, an image or a video's header."""
     from anytouch_jax.data import images, stacks
 
     stack = stacks.read_stack(data)
@@ -411,11 +459,11 @@ def count_frames(data: Path) -> int:
 def numbered_frames(data: Path, on_bad_sample: str, times: list[float]) -> Iterator[NumberedFrame]:
     """Yield number, name and RGB u8 pixels of each frame.
 
-    A folder's pictures come in natural order. The frames of a video or a stack have no names.
+    A folder's images come in natural order. The frames of a video or a stack have no names.
 
     Args:
-        data: a folder, a picture, a stack of frames (.npy, .npz) or a video.
-        on_bad_sample: with "skip", a picture that cannot be read is None, and the first are logged.
+        data: a folder, an image, a stack of frames (.npy, .npz) or a video.
+        on_bad_sample: with "skip", an image that cannot be read is None, and the first are logged.
         times: the time stamps of a video's frames are appended to it, s.
     """
     from anytouch_jax.data import images, stacks
@@ -426,7 +474,7 @@ def numbered_frames(data: Path, on_bad_sample: str, times: list[float]) -> Itera
     elif stack is not None:
         for number, frame in enumerate(stacks.stacked_frames(stack, data)):
             yield number, "", frame
-    elif images.picture_files(data):
+    elif images.image_files(data):
         yield 0, data.name, images.decode(data)
     else:
         for number, (seconds, frame) in enumerate(images.timed_frames(data)):
@@ -435,7 +483,7 @@ def numbered_frames(data: Path, on_bad_sample: str, times: list[float]) -> Itera
 
 
 def _frames_of_folder(data: Path, on_bad_sample: str) -> Iterator[NumberedFrame]:
-    """Yield number, name and pixels of the pictures of a folder."""
+    """Yield number, name and pixels of the images of a folder."""
     from anytouch_jax.data import images
     from anytouch_jax.data.loading.samples import NAMED
     from anytouch_jax.data.names import frame_numbers, split_series

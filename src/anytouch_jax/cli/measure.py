@@ -23,10 +23,10 @@ if TYPE_CHECKING:
     from anytouch_jax.data.manifest.manifest import Manifest
     from anytouch_jax.encoder.encoder import Encoder
     from anytouch_jax.encoder.measured import Fields
-    from anytouch_jax.fields.film import Film
     from anytouch_jax.fields.results import Results
+    from anytouch_jax.fields.video import Video
 
-_BATCH = 16  # frames, which are whole pictures of the camera
+_BATCH = 16  # frames, which are whole images of the camera
 _INTERRUPTED = 130  # exit status
 
 
@@ -40,17 +40,17 @@ class MeasureOptions(inputs.SensorOptions):
     Ctrl-C ends the measurement, and what was measured is written.
     """
 
-    # Manifests (.csv, .parquet), or one folder of frames, stack (.npy, .npz), picture or video.
+    # Manifests (.csv, .parquet), or one folder of frames, stack (.npy, .npz), image or video.
     data: tuple[Path, ...]
     # The .npz to write, with maps of every frame. Its numbers go to a .csv of the same name.
     out: Path
     width_mm: Above0[float | None] = None
-    """What the width of the picture shows, in mm. Known and fitted sensors need none. For others
-    lengths are else shares of it.
+    """What the width of the image shows, in mm. Known and fitted sensors need none. For others
+    lengths are else fractions of it.
     """
     split: str | None = None  # Only this split of a manifest.
-    # Film of the frames with depth, shear and force (.mp4, .avi), at the rate of the recording.
-    film: Path | None = None
+    # Video of the frames with depth, shear and force (.mp4, .avi), at the rate of the recording.
+    video: Path | None = None
     ply: Path | None = None
     """Surface of the deepest frame, a mesh in mm (.ply): x to the right, y down, z away from the
     camera.
@@ -73,7 +73,7 @@ class _Touch(NamedTuple):
 
 
 class _Work(NamedTuple):
-    """What is measured by which encoder, and the frames a second of a film of it."""
+    """What is measured by which encoder, and the frames a second of a video of it."""
 
     options: MeasureOptions
     encoder: Encoder
@@ -91,22 +91,22 @@ class _Deepest(NamedTuple):
 
 
 def run(options: MeasureOptions) -> int:
-    """Write maps, numbers, and if asked a film and a surface; 130 after Ctrl-C."""
-    from anytouch_jax.fields.film import Film
+    """Write maps, numbers, and if asked a video and a surface; 130 after Ctrl-C."""
     from anytouch_jax.fields.results import Results
+    from anytouch_jax.fields.video import Video
 
     work = _resolve(options)
     with contextlib.ExitStack() as stack:
         results = stack.enter_context(contextlib.closing(Results(options.out)))
-        film = None
-        if options.film is not None:
-            film = stack.enter_context(contextlib.closing(Film(options.film, work.rate)))
-        deepest, is_whole = _measure(work, results, film)
+        video = None
+        if options.video is not None:
+            video = stack.enter_context(contextlib.closing(Video(options.video, work.rate)))
+        deepest, is_whole = _measure(work, results, video)
         if not len(results):
             raise UserError(
                 f"there are no frames to measure in {options.data[0]}. Check the path, and --split."
             )
-        out, table = _write(work, results, film, deepest, is_whole=is_whole)
+        out, table = _write(work, results, video, deepest, is_whole=is_whole)
         if not work.is_manifest:
             inputs.log_universal(work.encoder, options)
         print(f"{out} and {table}: {len(results)} frames")
@@ -129,10 +129,10 @@ def _resolve(options: MeasureOptions) -> _Work:
     check_folder(options.out, read=read, suffix=".npz")
     check_folder(options.table, read=read)
     check_folder(options.ply, "--ply", read=read, suffix=".ply")
-    if options.film is not None:
-        suffix = ".avi" if options.film.suffix == ".avi" else ".mp4"
-        check_folder(options.film, "--film", read=read, suffix=suffix)
-    check_apart(out=options.out, film=options.film, ply=options.ply)
+    if options.video is not None:
+        suffix = ".avi" if options.video.suffix == ".avi" else ".mp4"
+        check_folder(options.video, "--video", read=read, suffix=suffix)
+    check_apart(out=options.out, video=options.video, ply=options.ply)
     inputs.check_sensor(options)
     encoder = load_encoder(options.model)
     if not encoder.measures:
@@ -147,13 +147,13 @@ def _resolve(options: MeasureOptions) -> _Work:
     return _Work(options, encoder, touches, _rate_of_frames(options.data[0]), is_manifest)
 
 
-def _measure(work: _Work, results: Results, film: Film | None) -> tuple[_Deepest | None, bool]:
+def _measure(work: _Work, results: Results, video: Video | None) -> tuple[_Deepest | None, bool]:
     """Write the fields of all touches as they come.
 
     Return the deepest frame, and whether nothing interrupted it. The first Ctrl-C, or SIGTERM, lets
     the batch at hand end, so that all results have the same frames.
     """
-    from anytouch_jax.fields.pictures import overlay
+    from anytouch_jax.fields.images import overlay
 
     deepest: _Deepest | None = None
     asked = list[int]()
@@ -173,8 +173,8 @@ def _measure(work: _Work, results: Results, film: Film | None) -> tuple[_Deepest
                 depth = float(measured.depth[row].max())
                 if deepest is None or depth > deepest.depth:
                     deepest = _Deepest(depth, frame, measured[row])
-                if film is not None:
-                    film.add(overlay(frame, measured, row))
+                if video is not None:
+                    video.add(overlay(frame, measured, row))
             if asked:
                 return deepest, False
     return deepest, True
@@ -183,7 +183,7 @@ def _measure(work: _Work, results: Results, film: Film | None) -> tuple[_Deepest
 def _write(
     work: _Work,
     results: Results,
-    film: Film | None,
+    video: Video | None,
     deepest: _Deepest | None,
     *,
     is_whole: bool,
@@ -192,7 +192,7 @@ def _write(
 
     Results of a part do not replace a file that is there: they get the name NAME.part.
     """
-    from anytouch_jax.fields.pictures import write_surface
+    from anytouch_jax.fields.images import write_surface
 
     options = work.options
 
@@ -207,9 +207,9 @@ def _write(
     results.save(out, table, about)
     if options.ply is not None and deepest is not None:
         write_surface(place(options.ply), deepest.frame, deepest.measured)
-    # Last, because only a film may turn out to be unwritable at its end.
-    if film is not None and options.film is not None:
-        film.finish(place(options.film))
+    # Last, because only a video may turn out to be unwritable at its end.
+    if video is not None and options.video is not None:
+        video.finish(place(options.video))
     return out, table
 
 
@@ -242,7 +242,7 @@ def _measured(
 
 
 def _of_frames(encoder: Encoder, options: MeasureOptions) -> Iterator[_Touch]:
-    """Yield every frame of a folder, a stack, a picture or a video."""
+    """Yield every frame of a folder, a stack, an image or a video."""
     import numpy as np
 
     from anytouch_jax.config import UNIVERSAL
@@ -282,26 +282,26 @@ def _of_manifest(encoder: Encoder, options: MeasureOptions, manifest: Manifest) 
     """
     import numpy as np
 
-    from anytouch_jax.data.background.rule import UnitGels
+    from anytouch_jax.data.background.rule import Backgrounds
     from anytouch_jax.data.images import decode
     from anytouch_jax.encoder.embed import rows_with_gel
 
     length = encoder.config.model.frames
     rows = np.arange(len(manifest)) if options.split is None else manifest.rows_of(options.split)
     rows = inputs.usable_rows(manifest, rows, 1)
-    gels = UnitGels(manifest)
+    backgrounds = Backgrounds(manifest)
     if encoder.subtracts:
-        log(gels.report(rows))
-    rows = rows_with_gel(encoder, gels, rows, log)
+        log(backgrounds.report(rows))
+    rows = rows_with_gel(encoder, backgrounds, rows, log)
     before = {later: earlier for earlier, later in manifest.clips(2).tolist()}
     sensors = manifest.text_column("sensor")
-    picture = lru_cache(length)(decode)  # a frame is in `length` clips, one after the other
-    gel_of = gels.shared(lambda gel: gel)
+    image = lru_cache(length)(decode)  # a frame is in `length` clips, one after the other
+    gel_of = backgrounds.shared(lambda gel: gel)
     for row in tracked(rows.tolist(), "frames measured", len(rows)):
         clip = [row]
         while len(clip) < length:
             clip.append(before.get(clip[-1], clip[-1]))
-        frames = [picture(manifest.file(one)) for one in reversed(clip)]
+        frames = [image(manifest.file(one)) for one in reversed(clip)]
         last = frames[-1]
         frames = [frame if frame.shape == last.shape else last for frame in frames]
         gel = gel_of(row) if encoder.subtracts else None
@@ -310,13 +310,13 @@ def _of_manifest(encoder: Encoder, options: MeasureOptions, manifest: Manifest) 
 
 
 def _rate_of_frames(data: Path) -> float:
-    """Return the frames a second of a video; a folder, a stack or a picture has a usual rate."""
+    """Return the frames a second of a video; a folder, a stack or an image has a usual rate."""
     import cv2
 
     from anytouch_jax.data import images, stacks
-    from anytouch_jax.fields.film import RATE
+    from anytouch_jax.fields.video import RATE
 
-    if stacks.read_stack(data) is not None or images.picture_files(data) is not None:
+    if stacks.read_stack(data) is not None or images.image_files(data) is not None:
         return RATE
     video = images.open_video(data)
     try:
@@ -330,7 +330,7 @@ def _rate_of_rows(manifest: Manifest) -> float:
     """Return the frames a second of the time stamps of a manifest, a usual rate without any."""
     import numpy as np
 
-    from anytouch_jax.fields.film import RATE
+    from anytouch_jax.fields.video import RATE
 
     times = np.zeros(0)
     with contextlib.suppress(UserError):  # of text: the column is the user's own

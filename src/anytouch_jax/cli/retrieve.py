@@ -31,7 +31,7 @@ from anytouch_jax.files import atomic_write
 if TYPE_CHECKING:
     import numpy as np
 
-    from anytouch_jax.data.background.rule import UnitGels
+    from anytouch_jax.data.background.rule import Backgrounds
     from anytouch_jax.data.manifest.manifest import Manifest
     from anytouch_jax.encoder.encoder import Encoder
     from anytouch_jax.evaluate.retrieval import Retrieval
@@ -51,10 +51,10 @@ class RetrieveOptions:
     # Manifest with the columns touch and unit, and contact labels (label.x, y, depth, force).
     data: Path | None = None
     index: Path | None = None  # Features of `anytouch embed` to search in, of any sensors.
-    # What to look for in --index: a picture, a folder or video (last clip), or a sentence.
+    # What to look for in --index: an image, a folder or video (last clip), or a sentence.
     query: str | None = None
     sensor: str | None = None  # Sensor of the query. Without it the universal tokens are used.
-    background: Path | None = None  # Picture of the untouched gel of the query.
+    background: Path | None = None  # Image of the untouched gel of the query.
     count: Count[int] = 10  # Nearest touches to list.
     # Search in the nearest cells alone (FAISS), for very many features.
     approximate: bool = False
@@ -93,7 +93,7 @@ def run_retrieve(options: RetrieveOptions) -> int:
 
 def _score(options: RetrieveOptions, data: Path) -> int:
     """Score retrieval by every encoder and control, print a table, and write JSON with --out."""
-    from anytouch_jax.data.background.rule import UnitGels
+    from anytouch_jax.data.background.rule import Backgrounds
     from anytouch_jax.data.manifest import manifest as manifests
     from anytouch_jax.encoder import embed as embedding
     from anytouch_jax.evaluate import retrieval
@@ -105,9 +105,9 @@ def _score(options: RetrieveOptions, data: Path) -> int:
     table = manifests.read(data)
     rows = _rows(options, table)
     encoders = _encoders(options)
-    gels = UnitGels(table)
+    backgrounds = Backgrounds(table)
     for encoder in encoders.values():
-        rows = embedding.rows_with_gel(encoder, gels, rows, log)
+        rows = embedding.rows_with_gel(encoder, backgrounds, rows, log)
     settings: dict[str, Any] = {
         "gallery_size": options.gallery,
         "match": None if options.by_chance else retrieval.COVARIATES,
@@ -115,8 +115,8 @@ def _score(options: RetrieveOptions, data: Path) -> int:
     }
     # raises for an impossible gallery, before the work
     retrieval.cross_sensor_retrieval(table, {}, rows, **settings)
-    log(gels.report(rows))
-    values = _features(options, encoders, table, rows, gels)
+    log(backgrounds.report(rows))
+    values = _features(options, encoders, table, rows, backgrounds)
     scores = retrieval.cross_sensor_retrieval(
         table, values, rows, metrics={VECTOR: "euclidean"}, **settings
     )
@@ -160,7 +160,7 @@ def _features(
     encoders: Mapping[str, Encoder],
     table: Manifest,
     rows: np.ndarray,
-    gels: UnitGels,
+    backgrounds: Backgrounds,
 ) -> dict[str, np.ndarray]:
     """Return the features of the rows by every encoder, and by the controls without one."""
     from anytouch_jax.encoder.embed import embed_rows
@@ -171,7 +171,7 @@ def _features(
     values = {}
     for name, encoder in encoders.items():
         kept, values[name] = embed_rows(
-            encoder, table, rows, options.frames, options.pooling, gels=gels, log=log
+            encoder, table, rows, options.frames, options.pooling, backgrounds=backgrounds, log=log
         )
         if len(kept) < len(rows):
             raise UserError(
@@ -179,7 +179,7 @@ def _features(
                 "first."
             )
     if options.controls:
-        pixels = partial(background_difference, gels=gels)
+        pixels = partial(background_difference, backgrounds=backgrounds)
         for name, make in ((PIXELS, pixels), (VECTOR, retrieval.contact_vector)):
             try:
                 values[name] = make(table, rows)
@@ -200,7 +200,7 @@ def _search(options: RetrieveOptions, index_file: Path) -> int:
     refuse_unused(options, others, "with --index, whose features are searched")
     if options.query is None:
         raise UserError(
-            "Give what to look for with --query: a picture, a folder, a video or a sentence."
+            "Give what to look for with --query: an image, a folder, a video or a sentence."
         )
     if len(options.model) > 1:
         raise UserError(f"A search takes one encoder, not {len(options.model)}. Give one --model.")
@@ -212,7 +212,7 @@ def _search(options: RetrieveOptions, index_file: Path) -> int:
     model = options.model[0] if options.model else Path(DEFAULT)
     encoder = load_encoder(model)
     index.check(encoder.source, encoder.fingerprint)
-    query = _query(options, options.query, encoder, index.about, index.gels)
+    query = _query(options, options.query, encoder, index.about, index.backgrounds)
     ids, cosines = index.search(query, options.count)
     hits = []
     for row, cosine in zip(ids[0], cosines[0], strict=True):
@@ -237,7 +237,7 @@ def _query(
 
     Args:
         options: of the command.
-        query: a picture, a folder or video, of which the last clip counts, or a sentence.
+        query: an image, a folder or video, of which the last clip counts, or a sentence.
         encoder: that the index was made by.
         about: how the features of the index were made.
         known: backgrounds by sensor instance, of the index.
@@ -260,7 +260,8 @@ def _query(
                 f"A sentence is compared with features of pooling class, not {pooling}. Embed "
                 "again."
             )
-        return encoder.encode_text(query)
+        # A sentence says nothing of what a convolutional trunk adds to the features.
+        return np.pad(encoder.encode_text(query), ((0, 0), (0, encoder.config.model.sight)))
     length = 1
     if about.get("frames", "1").isdecimal():
         length = int(about.get("frames", "1"))
@@ -268,15 +269,17 @@ def _query(
     gel, _ = choose_gel(encoder, options.background, path, known, "the index was made with")
     preprocess = Preprocess(encoder, gel)
     clip = np.stack([preprocess(frame) for frame in frames])[None]
-    join: Any = about.get("join", "mean")
-    return encoder.encode_touch(clip, options.sensor or UNIVERSAL, pooling=pooling, join=join)
+    aggregation: Any = about.get("join", "mean")
+    return encoder.encode_touch(
+        clip, options.sensor or UNIVERSAL, pooling=pooling, aggregation=aggregation
+    )
 
 
 def _last_frames(path: Path, length: int) -> list[np.ndarray]:
-    """Return the last frames of a folder or video, or a picture as often as a clip is long."""
+    """Return the last frames of a folder or video, or an image as often as a clip is long."""
     from anytouch_jax.data import images
 
-    files = images.picture_files(path)
+    files = images.image_files(path)
     if files is None:
         frames = list(images.frames_from_video(path))[-length:]
     else:
@@ -307,17 +310,17 @@ _COLUMNS = (
 
 def _cells(score: Retrieval) -> tuple[str, ...]:
     """Return the cells of _COLUMNS."""
-    from anytouch_jax.evaluate.tables import interval_text, share_text
+    from anytouch_jax.evaluate.tables import fraction_text, interval_text
 
     return (
         score.name,
         score.query_sensor,
         score.gallery_sensor,
         "yes" if score.centred else "no",
-        share_text(score.top1),
+        fraction_text(score.top1),
         interval_text(score.low, score.high),
-        share_text(score.top5),
-        share_text(score.chance1),
+        fraction_text(score.top5),
+        fraction_text(score.chance1),
         str(score.gallery),
         str(score.queries),
     )
@@ -325,18 +328,18 @@ def _cells(score: Retrieval) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class ReportOptions:
-    """Report on a stage-1 and a stage-2 run: samples, losses, retrieval, probes.
+    """Report what a stage-1 and a stage-2 run have learned, beside guesses.
 
     Example: anytouch report --data data/scenes/manifest.parquet --stage1 runs/stage1 --stage2
     runs/stage2 --out report
 
-    The report has reconstructions and a t-SNE, too.
+    It begins with three sentences, and has retrieval, probes, hidden patches and losses.
     """
 
     data: Path  # Manifest of simulated scenes, or one with the same columns.
     stage1: Path  # Run folder of stage 1.
     stage2: Path  # Run folder of stage 2.
-    # Folder for report.html (one file with its pictures), report.md, report.json, figures/.
+    # Folder for report.html (one file with its images), report.md, report.json, figures/.
     out: Path
     # Touches of the test split to use, and half as many of train and val.
     touches: Count[int] = 200

@@ -18,22 +18,22 @@ from anytouch_jax.errors import UserError
 
 @dataclass(frozen=True, kw_only=True)
 class FitOptions:
-    """Fit the look of your sensor to 5 to 50 pictures of it, for the simulator.
+    """Fit the look of your sensor to 5 to 50 images of it, for the simulator.
 
     Example: anytouch sensor fit pictures/ --name mine --width-mm 18.6 --out mine.sensor
 
-    Press all kinds of objects into the gel, at changing places, and add a few pictures of the
+    Press all kinds of objects into the gel, at changing places, and add a few images of the
     untouched gel. The folder has readable numbers (sensor.json), which say how sure each is, and
-    real next to simulated pictures (look.png). `data simulate --sensors`, `train
+    real next to simulated images (look.png). `data simulate --sensors`, `train
     --simulated.sensors` and `adapt --sensor` take it like the name of a sensor.
     """
 
-    # Folder of pictures of one unit, upright and not cropped.
+    # Folder of images of one unit, upright and not cropped.
     frames: Annotated[Path, Positional]
     name: str  # Name of the sensor.
-    width_mm: Above0[float]  # Width of the gel that a picture shows, mm.
+    width_mm: Above0[float]  # Width of the gel that an image shows, mm.
     out: Path  # Folder to write, NAME.sensor.
-    # Picture of the untouched gel. Without it, the median of all pictures.
+    # Image of the untouched gel. Without it, the median of all images.
     background: Path | None = None
     # All presses are of a ball of this diameter, mm. Its slopes are known.
     ball_mm: Above0[float | None] = None
@@ -52,9 +52,9 @@ def run_fit(options: FitOptions) -> int:
     files, named = list_images(options.frames)
     background = options.background or named.get("background")
     gel = None if background is None else to_rgb(decode(background), background)
-    pictures = [to_rgb(decode(file), file) for file in files]
+    images = [to_rgb(decode(file), file) for file in files]
     fitted = fit_sensor(
-        pictures,
+        images,
         options.name,
         options.width_mm,
         options.out,
@@ -65,14 +65,14 @@ def run_fit(options: FitOptions) -> int:
         log(f"{part}: {words}")
     log("simulating touches of it, about two minutes at the first time")
     seen = fitted.seen
-    picture = options.out / "look.png"
-    share = compare(
-        seen.frames[seen.pressed], seen.gel, options.out, picture, ball_mm=options.ball_mm
+    image = options.out / "look.png"
+    fraction = compare(
+        seen.frames[seen.pressed], seen.gel, options.out, image, ball_mm=options.ball_mm
     )
     print(f"{options.out}: {options.name}, {fitted.colour.source}")
     print(
-        f"{picture}: real pictures above simulated ones. A linear classifier knows one from the "
-        f"other in {share:.0%} of the cases, where 50 % is chance."
+        f"{image}: real images above simulated ones. A linear classifier knows one from the "
+        f"other in {fraction:.0%} of the cases, where 50 % is chance."
     )
     return 0
 

@@ -20,7 +20,7 @@ from anytouch_jax.errors import UserError
 
 if TYPE_CHECKING:
     from anytouch_jax.encoder.encoder import Encoder
-    from anytouch_jax.encoder.linear_head import LinearHead
+    from anytouch_jax.encoder.linear_head import Head
     from anytouch_jax.encoder.measured import Measure
     from anytouch_jax.live.cameras import CameraSettings
     from anytouch_jax.live.page.live import Live
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 class CameraOptions:
     """What a camera is asked for. The log says what it gives."""
 
-    # Camera: width and height of its pictures, pixels.
+    # Camera: width and height of its images, pixels.
     camera_size: Count[tuple[int, int] | None] = None
     camera_fps: Above0[float | None] = None  # Camera: frames a second.
     camera_format: str | None = None  # Camera: format, four letters such as MJPG or YUYV.
@@ -75,7 +75,7 @@ class StreamOptions(CameraOptions, inputs.FrameOptions):
     """Also measure: each line has force, torque, depth, area, centre and slip, in N and mm, with
     deviations. Shear and slip need --frames 3.
     """
-    # --fields: mm that the picture's width shows. Known sensors need none.
+    # --fields: mm that the image's width shows. Known sensors need none.
     width_mm: Above0[float | None] = None
 
 
@@ -91,10 +91,10 @@ def run_stream(options: StreamOptions) -> int:
     source, live = stream.open_source(options.data, settings, log)
     nominal = nominal_rate(source)  # a source that is released has none
     if not live:
-        refuse_unused(options, [field.name for field in fields(CameraOptions)], "with a film")
+        refuse_unused(options, [field.name for field in fields(CameraOptions)], "with a video")
     given = inputs.load_inputs(options)
     measure = _measure_of(given.encoder, options) if options.fields else None
-    known = inputs.frames_input(given.encoder, options, Path(options.data), given.known_gels)
+    known = inputs.frames_input(given.encoder, options, Path(options.data), given.known_backgrounds)
     embedded = stream.stream_with(
         given.encoder,
         source,
@@ -104,7 +104,7 @@ def run_stream(options: StreamOptions) -> int:
             frames=options.frames,
             stride=options.stride,
             pooling=given.pooling,
-            join=options.join,
+            aggregation=options.aggregation,
             preprocess=known.preprocess,
             contact=known.gate,
             reuse=options.reuse,
@@ -119,7 +119,7 @@ def run_stream(options: StreamOptions) -> int:
     if result.error is not None and not result.total:
         raise result.error
     if not live and not result.interrupted:
-        _check_film(options, result)
+        _check_video(options, result)
     if not prints_lines:
         _save_stream(options, given, known, result, live=live)
     inputs.log_universal(given.encoder, options)
@@ -159,8 +159,8 @@ def _measure_of(encoder: Encoder, options: StreamOptions) -> Measure:
     )
 
 
-def _check_film(options: StreamOptions, result: Result) -> None:
-    """Log a film that is shorter than its header says.
+def _check_video(options: StreamOptions, result: Result) -> None:
+    """Log a video that is shorter than its header says.
 
     Raises UserError for one without a clip.
     """
@@ -209,22 +209,22 @@ def _save_stream(
         "estimated": result.estimated,
     }
     features = Features(result.values, result.numbers, keys)
-    features.gels.update(inputs.gels_of(known.preprocess, options))
+    features.backgrounds.update(inputs.backgrounds_of(known.preprocess, options))
     features.predictions.update(result.fields or {})
     features.predictions["contact"] = result.contact
     embed.save_features(options.out, given.encoder, features, given.head, options, about)
 
 
-def _print_line(frame: Embedded, live: bool, head: LinearHead | None) -> None:
+def _print_line(frame: Embedded, live: bool, head: Head | None) -> None:
     """Print a frame as a line of JSON."""
     line: dict[str, Any] = {"frame": frame.number, "time": round(frame.time, 6)}
     if live:
-        line |= {"picture": frame.picture, "missed": frame.missed}
+        line |= {"picture": frame.image, "missed": frame.missed}
     line["reused"] = frame.reused
     if frame.estimated:
         line["background"] = "estimated"
     if head is not None:
-        line |= _predicted(head, frame)
+        line |= head.summary(frame.values[None])
     is_known = frame.contact == frame.contact  # NaN is unknown
     line["contact"] = bool(frame.contact) if is_known else None
     if frame.fields is not None:
@@ -234,35 +234,20 @@ def _print_line(frame: Embedded, live: bool, head: LinearHead | None) -> None:
     print(json.dumps(line), flush=True)
 
 
-def _predicted(head: LinearHead, frame: Embedded) -> dict[str, Any]:
-    """Return the class of a frame, and what the calibration of the head says of it."""
-    features = frame.values[None]
-    if head.calibration is None:
-        (label,), p = head(features)
-        return {"label": str(label), "p": round(float(p.max()), 6)}
-    one = head.assess(features)
-    return {
-        "label": str(one.label[0]),
-        "p": round(float(one.p.max()), 6),
-        "set": head.classes[one.in_set[0]].tolist(),
-        "novel": bool(one.novel[0]),
-    }
-
-
 @dataclass(frozen=True, kw_only=True)
 class ViewOptions(CameraOptions):
     """Show recordings, features, a run or a camera on a page in the browser.
 
     Example: anytouch view manifest.parquet features.npz runs/stage1
 
-    Name a manifest, a folder of pictures, a film, a features file of `anytouch embed`, a run
+    Name a manifest, a folder of images, a video, a features file of `anytouch embed`, a run
     folder, the word examples, or a camera: 0, a part of its name, its serial, or an address http://
     or rtsp://. Without any, the page shows the cameras that are connected, and the examples.
-    Features show their pictures if their manifest is named, too. Press Ctrl-C to stop.
+    Features show their images if their manifest is named, too. Press Ctrl-C to stop.
     """
 
     paths: Positional[tuple[str, ...]] = ()  # What to show, several at once.
-    live: bool = False  # Play films as if they came from a camera.
+    live: bool = False  # Play videos as if they came from a camera.
     # Encoder of a camera: a name, a run, a weights file, or hf://user/repo.
     model: Path = Path(DEFAULT)
     sensor: str | None = None  # Sensor of a camera. Without it, the universal tokens are used.
@@ -291,11 +276,11 @@ def run_view(options: ViewOptions) -> int:
 
     played = list[str]()
     if options.live:
-        played = [path for path in options.paths if _is_film(Path(path))]
+        played = [path for path in options.paths if _is_video(Path(path))]
     cameras = [path for path in options.paths if path in played or camera_of(path) is not None]
     if not cameras and options.paths:
         refuse_unused(
-            options, ("model", "sensor", "head", "out"), "without a camera, or a film with --live"
+            options, ("model", "sensor", "head", "out"), "without a camera, or a video with --live"
         )
     if len(cameras) == len(played) and options.paths:
         refuse_unused(options, [field.name for field in fields(CameraOptions)], "without a camera")
@@ -321,15 +306,14 @@ def run_view(options: ViewOptions) -> int:
     return 0
 
 
-def _is_film(path: Path) -> bool:
+def _is_video(path: Path) -> bool:
     """Return whether a path is a file that --live can play: not a table, not features."""
     return path.is_file() and path.suffix.lower() not in (".csv", ".parquet", ".npz")
 
 
 def _open_camera(options: ViewOptions, camera: str, sources: list[Source]) -> Live:
-    """Return the live page of a camera, or of a film in its place."""
+    """Return the live page of a camera, or of a video in its place."""
     from anytouch_jax.encoder.encoder import load_encoder
-    from anytouch_jax.encoder.linear_head import load_head
     from anytouch_jax.live.examples import EXAMPLE, SENSOR
     from anytouch_jax.live.page.live import Live
     from anytouch_jax.train.mesh import enable_compilation_cache
@@ -338,7 +322,7 @@ def _open_camera(options: ViewOptions, camera: str, sources: list[Source]) -> Li
     if str(options.model) == DEFAULT:
         log(f"encoder: {DEFAULT} (name another with --model)")
     encoder = load_encoder(options.model)
-    head = None if options.head is None else load_head(options.head)
+    head = inputs.head_in_use(options.model, options.head)
     if head is not None:
         head.check(encoder.source, encoder.fingerprint, head.pooling, 1)
     # Live touch is compared with the first features that are shown.

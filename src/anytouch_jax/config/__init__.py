@@ -11,7 +11,7 @@ from anytouch_jax.config.model import (
     TextTower,
     check_spelling,
 )
-from anytouch_jax.config.parsing import parse_json
+from anytouch_jax.config.parsing import parse_json, read_value
 from anytouch_jax.config.presets import preset
 from anytouch_jax.config.train import (
     CLIP_MEAN,

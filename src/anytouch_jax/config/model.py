@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from anytouch_jax.config.parsing import Above0, Finite, NotNegative, Range, check
-from anytouch_jax.errors import ConfigError, letters_apart
+from anytouch_jax.errors import ConfigError, edit_distance
 from anytouch_jax.sensors import RECORDS
 from anytouch_jax.shown import shown_short
 
@@ -51,7 +51,7 @@ def check_spelling(name: str, known: Iterable[str] = ()) -> None:
         return
     # Words of other lengths are further apart: the distance is the slow part.
     alike = [sensor for sensor in sorted(names) if abs(len(sensor) - len(name)) <= _LETTERS]
-    distances = [(letters_apart(word, plain(one)), one) for one in alike]
+    distances = [(edit_distance(word, plain(one)), one) for one in alike]
     apart, nearest = min(distances, default=(_LETTERS + 1, ""))
     if apart <= _LETTERS and digits(word) <= digits(nearest):
         raise SpellingError(
@@ -119,6 +119,8 @@ class ModelConfig:
     # Give the decoder the sensor tokens before encoding (release).
     decoder_sensor_tokens: bool = False
     patch_encoder: Literal["shared", "sensor"] = "shared"  # One, or one a sensor (T3).
+    # Values of the convolutional trunk that join the features of touch. 0: no trunk.
+    sight: Number = 0
     fields: Number = 0  # Channels of the decoder of depth, shear, contact and force. 0: none.
     # linear is the release, cosine is ours.
     match_head: Literal["mlp", "linear", "cosine", "none"] = "none"

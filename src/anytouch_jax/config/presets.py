@@ -114,7 +114,7 @@ def find_baseline(name: str) -> Baseline:
 
 # The universal tokens are never drawn and never trained.
 _SENSOR_TOKENS: dict[str, Any] = {"objective.universal_start": 0.0, "objective.universal_end": 0.0}
-_STILLS: dict[str, Any] = {"data.clip_share": 0.0}
+_STILLS: dict[str, Any] = {"data.clip_fraction": 0.0}
 _NO_CLIPS = _STILLS | {"objective.next_frame": False}
 _ALL = (
     Baseline("anytouch", "the paper's model, both stages"),
@@ -125,7 +125,7 @@ _ALL = (
     ),
     Baseline(
         "unitouch",
-        "UniTouch: touch-vision InfoNCE on stills with a photograph, tokens of each sensor alone",
+        "UniTouch: touch-vision InfoNCE on stills with an RGB image, tokens of each sensor alone",
         (2,),
         {"model.text": None, "model.match_head": "none", "data.require": ("image",)}
         | _SENSOR_TOKENS

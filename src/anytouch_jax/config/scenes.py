@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from anytouch_jax.config.parsing import Below1, Count, NotNegative, Seed, Share
+from anytouch_jax.config.parsing import Below1, Count, NotNegative, Ratio, Seed
 
 
 @dataclass(frozen=True)
@@ -38,9 +38,9 @@ class SceneOptions:
     frames: Count[int] = 10
     objects: Count[int] = 200  # Number of objects.
     depth: NotNegative[tuple[float, float]] = (0.3, 1.0)  # Range of the deepest press, mm.
-    vision: Share = 0.7  # Share of the recordings with a photograph.
-    text: Share = 0.7  # Share of the recordings with a caption.
-    # Share of the objects in the test split, by pairs of primitive and texture.
+    vision: Ratio = 0.7  # Fraction of the recordings with an RGB image.
+    text: Ratio = 0.7  # Fraction of the recordings with a caption.
+    # Fraction of the objects in the test split, by pairs of primitive and texture.
     held_out: Below1 = 0.25
     fields: tuple[str, ...] = ()  # Fields to write as .npy: displacement, pressure, shear.
     # Pixels of an image's shorter side. 0 keeps the sensor's resolution.

@@ -19,12 +19,13 @@ from anytouch_jax.config.parsing import (
     Count,
     NotNegative,
     Range,
+    Ratio,
     Seed,
-    Share,
     check,
 )
 from anytouch_jax.config.scenes import SceneOptions
 from anytouch_jax.errors import ConfigError
+from anytouch_jax.renamed import fields
 from anytouch_jax.shown import shown_short
 
 Recipe = Literal["paper", "release"]
@@ -32,7 +33,7 @@ Towers = Literal["none", "scratch", "pretrained"]
 PresetName = Literal["tiny", "small", "base", "large"]
 # how often the release draws these in an epoch
 RELEASE_WEIGHTS = (("touch_and_go", 2.0), ("octopi", 3.0))
-# Mean and standard deviation of RGB in 0..1: touch images (ImageNet) and photographs (CLIP), as in
+# Mean and standard deviation of RGB in 0..1: touch images (ImageNet) and RGB images (CLIP), as in
 # the release.
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
@@ -45,7 +46,7 @@ CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
 class LossConfig:
     """Weights and choices of the losses (Sec. 3.2 to 3.6 and appendix)."""
 
-    mask_ratio: Share = 0.75  # Share of the patches that is masked.
+    mask_ratio: Ratio = 0.75  # Fraction of the patches that is masked.
     norm_pix_loss: bool = False  # Predict pixels that are normalised within each patch.
     next_frame: bool = True  # Predict the next frame of a clip too.
     # Predict what changes from the last frame to the next one. Not in the paper.
@@ -56,7 +57,7 @@ class LossConfig:
     # Weight of cross-sensor matching relative to alignment (lambda, Eq. 9).
     match_weight: NotNegative[float] = 0.1
     match_keep: Annotated[float, Range(math.ulp(0.0), 1, "above 0, and 1 at most")] = 1.0
-    """Share of the patches that matching encodes. Not in the paper (after FLIP)."""
+    """Fraction of the patches that matching encodes. Not in the paper (after FLIP)."""
     # Weight of depth, shear and force (--model.fields). Not in the paper.
     field_weight: NotNegative[float] = 0.1
     terms: NotNegative[tuple[tuple[str, float], ...]] = ()
@@ -66,9 +67,9 @@ class LossConfig:
     # Subtract the batch mean from embeddings, against collapse of untrained towers.
     center_embeddings: bool = False
     # Probability of the universal tokens at the first step (p_u, Sec. 3.5).
-    universal_start: Share = 0.0
+    universal_start: Ratio = 0.0
     # Probability of the universal tokens at the last step, reached linearly.
-    universal_end: Share = 0.75
+    universal_end: Ratio = 0.75
 
     def __post_init__(self) -> None:
         check(self, "--objective.")
@@ -87,7 +88,7 @@ class LossConfig:
 
     @property
     def keep_ratio(self) -> float:
-        """Share of the patches that stays visible."""
+        """Fraction of the patches that stays visible."""
         return 1.0 - self.mask_ratio
 
 
@@ -98,7 +99,7 @@ class OptimConfig:
 
     learning_rate: NotNegative[float] = 2e-4  # Highest learning rate, reached after the warm-up.
     min_rate: NotNegative[float] = 0.0  # Learning rate at the end.
-    # Warm-up steps. None: one epoch, or a share of the run if that is shorter.
+    # Warm-up steps. None: one epoch, or a fraction of the run if that is shorter.
     warmup: NotNegative[int | None] = None
     decay: Literal["linear", "cosine"] = "linear"  # Form of the decay after the warm-up.
     beta1: Below1 = 0.9  # AdamW's decay of the first moment.
@@ -107,7 +108,7 @@ class OptimConfig:
     eps: Annotated[float, Range(1.2e-38, math.inf, "1.2e-38 or more (float32)")] = 1e-8
     weight_decay: NotNegative[float] = 0.1  # Weight decay of matrices. Vectors have none.
     # Learning-rate decay from a block of the touch encoder to the one before. 1: off.
-    layer_decay: Share = 1.0
+    layer_decay: Ratio = 1.0
     grad_clip: Above0[float | None] = None  # Largest norm of the gradient. None: no limit.
     accumulate: Count[int] = 1  # Batches whose gradients make one update.
 
@@ -116,6 +117,7 @@ class OptimConfig:
 
 
 @shown_short
+@fields(clip_share="clip_fraction")
 @dataclass(frozen=True)
 class DataConfig:
     """Reading and augmentation of the data."""
@@ -123,7 +125,7 @@ class DataConfig:
     manifests: tuple[str, ...] = ()  # Manifests to train on (--data).
     split: str = "train"  # Split to train on.
     batch_size: Count[int] = 64  # Samples of a step (--batch).
-    clip_share: Share = 0.5  # Share of clips. The rest are stills.
+    clip_fraction: Ratio = 0.5  # Fraction of clips. The rest are stills.
     # Batches of stills and clips: in turn, or mixed (release).
     order: Literal["alternate", "random"] = "alternate"
     weights: NotNegative[tuple[tuple[str, float], ...] | None] = None
@@ -142,12 +144,12 @@ class DataConfig:
     # Subtract the untouched gel (docs/sensor.md), or for half of the samples, at random. Not in the
     # paper.
     background: Literal["keep", "subtract", "either"] = "keep"
-    flip: Share = 0.5  # Probability of a mirror image, for each direction.
+    flip: Ratio = 0.5  # Probability of a mirror image, for each direction.
     affine: NotNegative[tuple[float, float, float]] = (0.0, 0.0, 0.0)
-    """Largest turn (degrees), shift and zoom (shares of the side)."""
+    """Largest turn (degrees), shift and zoom (fractions of the side)."""
     jitter: NotNegative[tuple[float, float, float, float]] = (0.4, 0.4, 0.5, 0.3)
     """Brightness, contrast, saturation, hue."""
-    rotation: NotNegative[float] = 20.0  # Largest rotation of photographs, degrees.
+    rotation: NotNegative[float] = 20.0  # Largest rotation of RGB images, degrees.
     # Tokenizer file. None: the run's, else CLIP's, else trained on the captions.
     tokenizer: str | None = None
     threads: NotNegative[int] = 2  # Threads that read and augment.
@@ -181,12 +183,12 @@ class SimulatedConfig:
         "9dtact",
     )
     """Sensors that are simulated: names, or folders NAME.sensor of `anytouch sensor fit`."""
-    coarse: Share = 0.4  # Share of touches at which each sensor touches as by hand.
-    # Share of touches by sensors that mix two others, for the universal tokens.
-    wild: Share = 0.0
+    coarse: Ratio = 0.4  # Fraction of touches at which each sensor touches as by hand.
+    # Fraction of touches by sensors that mix two others, for the universal tokens.
+    wild: Ratio = 0.0
     depth: NotNegative[tuple[float, float]] = (0.15, 1.0)  # Range of the deepest press, mm.
-    vision: Share = 0.4  # Share of touches with a photograph.
-    text: Share = SceneOptions.text  # Share of touches with a caption.
+    vision: Ratio = 0.4  # Fraction of touches with an RGB image.
+    text: Ratio = SceneOptions.text  # Fraction of touches with a caption.
     places: Count[int] = 4  # Photographed places of each object.
     # Steps that draw from the same simulated touches, with new masks and augmentations.
     reuse: Count[int] = 1
@@ -203,7 +205,7 @@ class RunConfig:
     steps: Count[int] = 1000  # Steps of the whole schedule.
     save_every: NotNegative[int] = 200  # Steps between checkpoints. 0 saves the last one only.
     keep: Count[int] = 3  # Latest checkpoints to keep, besides the best one.
-    figure_every: NotNegative[int] = 200  # Steps between pictures. 0: none.
+    figure_every: NotNegative[int] = 200  # Steps between images. 0: none.
     # Steps in a row that may be skipped for a loss or gradient that is not finite.
     max_skipped: NotNegative[int] = 20
     tensorboard: bool = False  # Write TensorBoard events too.
@@ -288,8 +290,13 @@ class Config:
         return ((r"(bias|scale|class_token)$", 0.0), (r"", self.optim.weight_decay))
 
 
-# Settings of version 0.1: new names, and those that are gone with the value that changes nothing.
-_RENAMED = {("objective", "centre"): "center_embeddings", ("optim", "clip_norm"): "grad_clip"}
+# Settings of older versions: new names, and below those that are gone, with the value that
+# changes nothing.
+_RENAMED = {
+    ("objective", "centre"): "center_embeddings",
+    ("optim", "clip_norm"): "grad_clip",
+    ("data", "clip_share"): "clip_fraction",
+}
 _RECIPE = "what the recipe implies"
 _RETIRED: dict[str, dict[str, Any]] = {
     "model": {"force_head": False},
@@ -330,7 +337,7 @@ def from_json(text: str, cls: type = Config, *, allow_retired: bool = True) -> A
 
 
 def _rename(whole: dict[str, Any]) -> None:
-    """Give the settings of version 0.1 their new names, in place."""
+    """Give the settings of older versions their new names, in place."""
     for (section, name), new_name in _RENAMED.items():
         settings = whole.get(section)
         if isinstance(settings, dict) and name in settings:

@@ -1,4 +1,4 @@
-"""Folders of pictures: their frames in order, their background and their RGB image."""
+"""Folders of images: their frames in order, their background and their RGB image."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def list_images(folder: str | Path) -> tuple[list[Path], dict[str, Path]]:
     """Return the frames of a folder in order (`frame_order`), and its other images by name.
 
     The others are called BACKGROUND and PHOTO. Arrays (.npy) count as frames only if there are no
-    pictures, because recorders put other data beside the pictures as arrays. Warns if the names
+    images, because recorders put other data beside the images as arrays. Warns if the names
     show no order.
 
     Raises:
@@ -35,20 +35,20 @@ def list_images(folder: str | Path) -> tuple[list[Path], dict[str, Path]]:
     ]
     named = {file.stem.lower(): file for file in files if file.stem.lower() in (BACKGROUND, PHOTO)}
     frames = [file for file in files if file.stem.lower() not in named]
-    pictures = [file for file in frames if file.suffix.lower() != ".npy"]
-    frames = pictures or frames
+    images = [file for file in frames if file.suffix.lower() != ".npy"]
+    frames = images or frames
     if not frames:
-        raise ImageError(f"{folder} has no pictures ({', '.join(SUFFIXES)}){_suggestion(folder)}")
+        raise ImageError(f"{folder} has no images ({', '.join(SUFFIXES)}){_suggestion(folder)}")
     names, is_clear = frame_order([file.name for file in frames])
     if not is_clear:
         warnings.warn(
-            f"the names in {folder} show no order of its pictures: they come by name", stacklevel=2
+            f"the names in {folder} show no order of its images: they come by name", stacklevel=2
         )
     return [folder / name for name in names], named
 
 
-def picture_files(path: Path) -> list[Path] | None:
-    """Return the picture at `path`, or the frames of a folder in order; None for a video.
+def image_files(path: Path) -> list[Path] | None:
+    """Return the image at `path`, or the frames of a folder in order; None for a video.
 
     Raises ImageError for a folder without any.
     """
@@ -60,9 +60,9 @@ def picture_files(path: Path) -> list[Path] | None:
 
 
 def _suggestion(folder: Path) -> str:
-    """Suggest what to use instead of a folder without pictures.
+    """Suggest what to use instead of a folder without images.
 
-    That is its manifest, or `anytouch data index` for pictures in sub-folders.
+    That is its manifest, or `anytouch data index` for images in sub-folders.
     """
     entries = sorted(folder.iterdir())
     for file in entries:

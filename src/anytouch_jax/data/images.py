@@ -10,10 +10,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from anytouch_jax.data.folders import BACKGROUND, PHOTO, SUFFIXES, list_images, picture_files
+from anytouch_jax.data.folders import BACKGROUND, PHOTO, SUFFIXES, image_files, list_images
+from anytouch_jax.data.image_headers import JPEG, PNG, check_header, decoded_chunks
 from anytouch_jax.data.manifest.files import read_file, unpack_npy
 from anytouch_jax.data.opencv import QUIET
-from anytouch_jax.data.picture_headers import JPEG, PNG, check_header, decoded_chunks
 from anytouch_jax.data.pixels import MAX_ASPECT, MAX_PIXELS, ImageError, to_rgb
 from anytouch_jax.data.videos import (
     VideoFile,
@@ -39,9 +39,9 @@ __all__ = [
     "encode",
     "frame_time",
     "frames_from_video",
+    "image_files",
     "list_images",
     "open_video",
-    "picture_files",
     "timed_frames",
     "to_rgb",
 ]
@@ -94,9 +94,9 @@ def decode_bytes(data: bytes, name: str | Path, *, as_stored: bool = False) -> n
     return to_rgb(pixels, name)
 
 
-def encode(picture: np.ndarray, suffix: str = ".png", *settings: int) -> bytes:
-    """Return a picture RGB u8 (h, w, 3) as PNG or JPEG; `settings` are those of cv2.imencode."""
-    return cv2.imencode(suffix, cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), settings)[1].tobytes()
+def encode(image: np.ndarray, suffix: str = ".png", *settings: int) -> bytes:
+    """Return an image RGB u8 (h, w, 3) as PNG or JPEG; `settings` are those of cv2.imencode."""
+    return cv2.imencode(suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR), settings)[1].tobytes()
 
 
 def _unpack(data: bytes) -> np.ndarray:
@@ -114,7 +114,7 @@ def _unpack(data: bytes) -> np.ndarray:
     except cv2.error as error:
         raise ValueError(error.err) from None
     if pixels is None:
-        raise ValueError("the picture is corrupt or cut short")
+        raise ValueError("the image is corrupt or cut short")
     if flags == cv2.IMREAD_UNCHANGED and pixels.ndim == 3 and pixels.shape[2] in (3, 4):
         if pixels.dtype not in _CONVERTED:  # of a TIFF
             return pixels[..., 2::-1]

@@ -129,7 +129,7 @@ def _is_rising(column: Sequence[Any]) -> bool:
     return all(a <= b for a, b in itertools.pairwise(column))
 
 
-def looks_like_film(names: Sequence[str]) -> bool:
+def looks_like_video(names: Sequence[str]) -> bool:
     """Return whether names of frames, in order, may be those of a video.
 
     They are if they count, or give times at a steady rate.
@@ -201,11 +201,11 @@ def split_series(names: Sequence[str]) -> dict[str, list[str]]:
     for name, (key, numbers) in zip(names, parts, strict=True):
         series.setdefault(key, []).append(name)
         owners.setdefault(numbers, set()).add(key)
-    share_numbers = any(numbers and len(keys) > 1 for numbers, keys in owners.items())
+    fraction_numbers = any(numbers and len(keys) > 1 for numbers, keys in owners.items())
     in_time = [key for key, _ in sorted(parts, key=lambda part: part[1])]
     changes = sum(a != b for a, b in itertools.pairwise(in_time))
     alternate = changes > len(series) and all(_SIDE.search(key) for key in series)
-    if len(series) > 1 and (share_numbers or alternate):
+    if len(series) > 1 and (fraction_numbers or alternate):
         return series
     return {"": list(names)}
 

@@ -20,7 +20,7 @@ def set_up() -> None:
     if _is_set_up:
         return
     # The loader has threads of its own already. The optical flow of dots depends on the number of
-    # threads (a stripe of the picture for each), so that one also keeps it reproducible.
+    # threads (a stripe of the image for each), so that one also keeps it reproducible.
     cv2.setNumThreads(1)
     # Our errors say what is wrong with a file. OpenCV's log would hide them.
     if "OPENCV_LOG_LEVEL" not in os.environ:

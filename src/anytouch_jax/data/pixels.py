@@ -27,7 +27,7 @@ def to_rgb(pixels: np.ndarray, path: str | Path) -> np.ndarray:
         path: What errors call it.
 
     Raises:
-        ImageError: For another shape or type, a picture that is too large or a strip, and floats
+        ImageError: For another shape or type, an image that is too large or a strip, and floats
             that are NaN or outside 0..1.
     """
     if pixels.ndim == 2:
@@ -63,7 +63,7 @@ def check_shape(shape: tuple[int, ...], path: str | Path) -> None:
             f"{path} has {width} x {height} pixels, more than the limit of {MAX_PIXELS}"
         )
     if max(height, width) > MAX_ASPECT * min(height, width):
-        raise ImageError(f"{path} has {width} x {height} pixels: that is a strip, not a picture")
+        raise ImageError(f"{path} has {width} x {height} pixels: that is a strip, not an image")
 
 
 def _check_range(pixels: np.ndarray, path: str | Path) -> None:

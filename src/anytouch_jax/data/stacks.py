@@ -20,7 +20,7 @@ _CHANNELS = (1, 3, 4)
 def read_stack(path: str | Path) -> Array | None:
     """Return the frames (T, h, w) or (T, h, w, channels) of a .npy or .npz file.
 
-    It is None for another file, and for one picture in a .npy. Frames of a .npy are read when they
+    It is None for another file, and for one image in a .npy. Frames of a .npy are read when they
     are used. Raises ImageError for a file without frames or with several arrays of them.
     """
     path = Path(path)
@@ -41,7 +41,7 @@ def read_stack(path: str | Path) -> Array | None:
 
 
 def _stack_of_npz(path: Path) -> Array:
-    """Return the only array of frames in a .npz file, or its only picture as a stack of one."""
+    """Return the only array of frames in a .npz file, or its only image as a stack of one."""
     try:
         shapes = read_arrays(path, only=lambda _: False)
     except (OSError, ValueError, zipfile.BadZipFile) as error:
@@ -50,7 +50,7 @@ def _stack_of_npz(path: Path) -> Array:
         raise ImageError(f"{path} contains features, not frames; name the frames that they are of")
     names = [name for name, array in shapes.items() if _is_stack(array)]
     if not names:
-        names = [name for name, array in shapes.items() if _is_picture(array)]
+        names = [name for name, array in shapes.items() if _is_image(array)]
     if len(names) != 1:
         held = ", ".join(f"{name} {array.shape}" for name, array in shapes.items()) or "nothing"
         found = "no array" if not names else f"{len(names)} arrays"
@@ -78,12 +78,12 @@ def _is_stack(array: Array) -> bool:
         return False
     if array.ndim == 4:
         return array.shape[-1] in _CHANNELS
-    # (h, w, 3) is one picture.
+    # (h, w, 3) is one image.
     return array.ndim == 3 and array.shape[-1] not in _CHANNELS
 
 
-def _is_picture(array: Array) -> bool:
-    """Whether an array is one picture (h, w), or (h, w, channels)."""
+def _is_image(array: Array) -> bool:
+    """Whether an array is one image (h, w), or (h, w, channels)."""
     has_channels = array.ndim == 3 and array.shape[-1] in _CHANNELS
     return _is_pixels(array) and (has_channels or array.ndim == 2)
 

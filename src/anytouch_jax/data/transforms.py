@@ -170,7 +170,7 @@ def check_proportions(frame: Sequence[int], background: Sequence[int]) -> None:
     if away > max(high, wide) / FORM:
         raise ImageError(
             f"the background has {wide} x {high} pixels and the frame {width} x {height}: one of "
-            "them was turned or cropped; give a picture taken as the frames are"
+            "them was turned or cropped; give an image taken as the frames are"
         )
 
 
@@ -260,7 +260,7 @@ class _Jitter:
         cv2.convertScaleAbs(self.image, dst=target)
 
     def _blend(self, operation: int, factor: float) -> None:
-        """Blend with another picture: factor * image + (1 - factor) * other.
+        """Blend with another image: factor * image + (1 - factor) * other.
 
         The other is black (brightness, 0), the mean grey of the image (contrast, 1), or the grey of
         each pixel (saturation, 2). `low` and `high` below bound its values.
@@ -322,7 +322,7 @@ def vision_transform(
     """Augment an RGB image u8 (h, w, 3) -> u8 (size, size, 3), and resize it as CLIP does.
 
     Args:
-        image: The whole picture.
+        image: The whole image.
         size: Pixels of a side of the result.
         rng: Of the row, see `augmentation_rng`.
         rotation: Largest rotation, degrees, to either side.

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Protocol
 import cv2
 import numpy as np
 
-from anytouch_jax.data.folders import picture_files
+from anytouch_jax.data.folders import image_files
 from anytouch_jax.data.opencv import QUIET
 from anytouch_jax.data.pixels import ImageError, check_shape, to_rgb
 from anytouch_jax.files import placeholder
@@ -80,8 +80,8 @@ def frame_time(video: _Decoder | VideoFile, number: int, last: float) -> float:
 
 
 def count_frames(path: str | Path) -> int:
-    """Return the number of frames of a picture, a folder or a video's header, 0 if unknown."""
-    files = picture_files(Path(path))
+    """Return the number of frames of an image, a folder or a video's header, 0 if unknown."""
+    files = image_files(Path(path))
     if files is not None:
         return len(files)
     video = open_video(path)

@@ -2,9 +2,9 @@
 of captions.
 
 The paper lets GPT-4o write the captions (AnyTouch, appendix). The wording of the prompts is ours,
-the inputs are the paper's. Touch and Go and TacQuad send one photograph. ObjectFolder Real sends
-two photographs and the tactile image, because the photographs can hide the touched place. TVL,
-SSVTP and Octopi send a photograph and a phrase.
+the inputs are the paper's. Touch and Go and TacQuad send one RGB image. ObjectFolder Real sends
+two RGB images and the tactile image, because the RGB images can hide the touched place. TVL,
+SSVTP and Octopi send an RGB image and a phrase.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet
 
 from anytouch_jax.config.parsing import parse_json
-from anytouch_jax.data.background.estimate import scale_picture
+from anytouch_jax.data.background.estimate import scale_image
 from anytouch_jax.data.images import decode_bytes, encode
 from anytouch_jax.data.manifest import schema
 from anytouch_jax.data.manifest.files import read_file
@@ -66,17 +66,17 @@ _FORM = (
 )
 _TEXTS: dict[Family, str] = {
     "photograph": (
-        "The photograph shows an object or a surface at the moment when it is touched. Decide what "
+        "The RGB image shows an object or a surface at the moment when it is touched. Decide what "
         "is touched, near where the finger or the sensor is, and describe the tactile properties "
         "of that place."
     ),
     "object": (
-        "{views} The place that is touched may be hidden there. The last picture "
+        "{views} The place that is touched may be hidden there. The last image "
         "is the imprint of the touched place on a soft gel with coloured light from its sides: it "
         "shows the local "
         "shape (edges, bumps, grooves, grain) of a patch about as large as a fingertip, and its "
         "colours mean nothing. "
-        "Take the object and the material from the photographs and the local shape from the "
+        "Take the object and the material from the RGB images and the local shape from the "
         "imprint, and describe the "
         "tactile properties of the touched place. Where they disagree, trust the imprint for shape "
         "and texture."
@@ -98,7 +98,7 @@ _REFUSAL = re.compile(
 
 
 class Prompt(NamedTuple):
-    """The words sent to the model. Images follow in the order photographs, tactile image."""
+    """The words sent to the model. Images follow in the order RGB images, tactile image."""
 
     family: Family
     system: str
@@ -129,14 +129,14 @@ def family_of(dataset: str | None, families: Mapping[str, str] | None = None) ->
     return family
 
 
-def make_prompt(family: Family, photographs: int, phrase: str | None = None) -> Prompt:
-    """Return the prompt of a family for a number of photographs and, in family phrase, the words to
+def make_prompt(family: Family, rgb_images: int, phrase: str | None = None) -> Prompt:
+    """Return the prompt of a family for a number of RGB images and, in family phrase, the words to
     expand.
     """
-    views = "The first two pictures are photographs of the same object from two sides."
-    if photographs == 1:
-        views = "The first picture is a photograph of the object."
-    view = "The photograph shows the place that is touched. " if photographs else ""
+    views = "The first two images are RGB images of the same object from two sides."
+    if rgb_images == 1:
+        views = "The first image is an RGB image of the object."
+    view = "The RGB image shows the place that is touched. " if rgb_images else ""
     quoted = json.dumps(" ".join((phrase or "").split()), ensure_ascii=False)
     text = _TEXTS[family].format(views=views, phrase=quoted, view=view)
     return Prompt(family, _SYSTEM, f"{text}\n\n{_FORM}")
@@ -196,7 +196,7 @@ def find_caption_jobs(
 ) -> tuple[list[CaptionJob], dict[str, int]]:
     """Return the captions to get, and the number of rows left out for each reason.
 
-    Rows of one touch share a caption. Rows without a touch share it by sequence. The photograph of
+    Rows of one touch share a caption. Rows without a touch share it by sequence. The RGB image of
     a group is that of its middle frame. Backgrounds and datasets without a prompt family are left
     out. Raises UserError if no caption is missing.
     """
@@ -215,7 +215,7 @@ def find_caption_jobs(
     for rows in sorted(groups, key=np.min):
         job = _make_job(manifest, rows, family[rows[0]], second_image)
         if job is None:
-            left_out["no photograph"] += len(rows)
+            left_out["no RGB image"] += len(rows)
         else:
             jobs.append(job)
     if not jobs:
@@ -245,7 +245,7 @@ def _rows_to_ask(
             remedy = "the manifest has no column dataset that names it"
             if name is not None:
                 known = f"; known: {', '.join(FAMILIES)}" if len(left_out) == 1 else ""
-                remedy = f"give it one, such as --family {shlex.quote(name)} photograph{known}"
+                remedy = f"give it one, such as --family {shlex.quote(name)} RGB image{known}"
             left_out[f"dataset {name!r} has no prompt: {remedy}"] = int(selected[rows].sum())
     selected &= family != None  # noqa: E711 - elementwise
     has_text = manifest.present("text")
@@ -299,7 +299,7 @@ def small_jpeg(data: bytes, name: str, side: int) -> bytes:
     Raises ImageError (a UserError).
     """
     pixels = decode_bytes(data, name)
-    pixels = scale_picture(pixels, side) if max(pixels.shape[:2]) > side else pixels
+    pixels = scale_image(pixels, side) if max(pixels.shape[:2]) > side else pixels
     return encode(pixels, ".jpg", cv2.IMWRITE_JPEG_QUALITY, 90)
 
 

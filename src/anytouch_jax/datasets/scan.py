@@ -1,8 +1,8 @@
 """File scan: existence, decoding, size, hash and colours of every file of a manifest; wrong
-pictures.
+images.
 
-Some copies of a dataset (TVL among them) hold touch images where the photographs should be. Touch
-images of one sensor look alike and photographs do not, so colours raise a suspicion. A background
+Some copies of a dataset (TVL among them) hold touch images where the RGB images should be. Touch
+images of one sensor look alike and RGB images do not, so colours raise a suspicion. A background
 image of the sensor confirms it: images that resemble it are touch images.
 """
 
@@ -34,7 +34,7 @@ STATES = ("ok", "missing", "outside", "empty", "truncated", "unreadable")
 OK = STATES.index("ok")
 FIELDS = 4  # colours are the means of 4 x 4 fields
 SPREAD, BOTTOM, BORDER, CHROMA, NOISE = range(5)  # columns of Scan.looks
-_CROP = 128  # side of the middle of a picture where noise is measured
+_CROP = 128  # side of the middle of an image where noise is measured
 _MAX_REASONS = 1000  # a million broken files must not fill the memory
 
 
@@ -44,7 +44,7 @@ class Scan(NamedTuple):
     `state` u8 (n,) indexes STATES. `size` i32 (n, 2) is width and height, 0 if not decoded.
     `digest` S32 (n,) is the first half of the SHA-256 in hex. `colours` is u8 (n, 48). `looks` f32
     (n, 5) are the measures of `_looks`, and `pixels` u32 (n,) is a checksum of the pixels. `bits`
-    u8 (n,) are those that a picture of 16 bits uses, else 0. `reasons` explains the first thousand
+    u8 (n,) are those that an image of 16 bits uses, else 0. `reasons` explains the first thousand
     bad files.
     """
 
@@ -65,7 +65,7 @@ class Scan(NamedTuple):
 
     @property
     def decoded(self) -> np.ndarray:
-        """Whether each file is a whole picture that was decoded, bool (n,)."""
+        """Whether each file is a whole image that was decoded, bool (n,)."""
         return (self.state == OK) & (self.size[:, 0] > 0)
 
 
@@ -200,9 +200,9 @@ def _judge(data: bytes, path: Path, is_image: bool) -> _FileState:
 def _looks(pixels: np.ndarray) -> np.ndarray:
     """Return measures of RGB u8 (h, w, 3) as f32 (5,).
 
-    In order: the standard deviation, and the share of rows at the bottom of one colour other than
-    black. The share of the largest black border. The mean range of a pixel's channels. The share of
-    the variance that is noise from pixel to pixel.
+    In order: the standard deviation, and the fraction of rows at the bottom of one colour other
+    than black. The fraction of the largest black border. The mean range of a pixel's channels. The
+    fraction of the variance that is noise from pixel to pixel.
     """
     # OpenCV needs a tenth of NumPy's time for these.
     rows, columns = (cv2.reduce(pixels, dim, cv2.REDUCE_MAX).reshape(-1, 3) for dim in (1, 0))
@@ -232,17 +232,17 @@ def _looks(pixels: np.ndarray) -> np.ndarray:
 
 
 def _leading(flags: np.ndarray) -> float:
-    """Return the share of flags bool (n,) before the first that is false, 0 if none is false."""
+    """Return the fraction of flags bool (n,) before the first that is false, 0 if none is false."""
     return float(np.argmin(flags)) / len(flags)
 
 
-# Pictures that decode but cannot be right: of one colour, cut, noise, repeated, turned, or unlike
-# their recording. Cameras, disks and scripts leave them behind. A picture is judged alone, or by
+# Images that decode but cannot be right: of one colour, cut, noise, repeated, turned, or unlike
+# their recording. Cameras, disks and scripts leave them behind. An image is judged alone, or by
 # the other frames of its sequence.
 _FEWEST = 5  # frames of a sequence that show what is usual in it
-_NARROW = 14  # bits of 16: more may be all that a dark picture uses
-_FROZEN = 3  # equal pictures in a row: cameras have noise
-_LAGS = (2, 3, 4)  # pictures of so many sensors may take turns in a sequence
+_NARROW = 14  # bits of 16: more may be all that a dark image uses
+_FROZEN = 3  # equal images in a row: cameras have noise
+_LAGS = (2, 3, 4)  # images of so many sensors may take turns in a sequence
 _ALONE = (
     ("flat", "of one colour"),
     ("cut", "of one colour from some row to the bottom, as a file is that was cut"),
@@ -251,7 +251,7 @@ _ALONE = (
 )
 _IN_SEQUENCE = (
     ("frozen", f"equal to the frames before ({_FROZEN} or more in a row)"),
-    ("alternating", "in sequences that jump between the pictures of several sensors"),
+    ("alternating", "in sequences that jump between the images of several sensors"),
     ("grey", "grey where their sequence is coloured"),
     ("dark", "much darker than their sequence"),
     ("inverted", "with inverted brightness for their sequence"),
@@ -260,8 +260,8 @@ _IN_SEQUENCE = (
 )
 
 
-def picture_faults(manifest: Manifest, scanned: Scan) -> Iterator[Finding]:
-    """Yield the kinds of pictures that cannot be right."""
+def image_faults(manifest: Manifest, scanned: Scan) -> Iterator[Finding]:
+    """Yield the kinds of images that cannot be right."""
     looks = scanned.looks
     narrow = np.zeros(len(scanned.bits), bool)
     source = np.stack([manifest.codes("dataset"), manifest.codes("sensor")], 1)
@@ -351,7 +351,7 @@ def _alternates(colours: np.ndarray) -> bool:
 
 
 def _variants(colours: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield the colours f32 (48,) of a picture as they were before each fault, with its kind."""
+    """Yield the colours f32 (48,) of an image as they were before each fault, with its kind."""
     fields = colours.reshape(FIELDS, FIELDS, 3)
     yield "inverted", 255 - colours
     yield "channels", fields[..., ::-1].ravel()
@@ -360,10 +360,10 @@ def _variants(colours: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
             yield "turned", np.rot90(fields[:, ::-1] if mirror else fields, turns).ravel()
 
 
-# Folders of touch images and photographs that are swapped.
+# Folders of touch images and RGB images that are swapped.
 _MIN_PAIRS = 8  # different pairs of images that are needed for an opinion on swapped folders
-_WIDER = 1.5  # touch images may spread this much more than photographs before they are suspect
-# share of the rows that must resemble the background images to call a dataset swapped
+_WIDER = 1.5  # touch images may spread this much more than RGB images before they are suspect
+# fraction of the rows that must resemble the background images to call a dataset swapped
 _CERTAIN = 0.95
 
 
@@ -420,7 +420,7 @@ def _background_colours(
 ) -> np.ndarray:
     """Return the colours f32 (k, 48) of the sensor's background images, k = 0 if it has none.
 
-    They are of `others`, background rows without a photograph, and of `rows`, but for those in the
+    They are of `others`, background rows without an RGB image, and of `rows`, but for those in the
     folder of the touch images.
     """
     code = scanned.files.code
@@ -429,7 +429,7 @@ def _background_colours(
         files.append(
             code["background_path"][rows[~in_touch_folder(manifest, "background_path")[rows]]]
         )
-    # A background that is also a photograph would confirm anything.
+    # A background that is also an RGB image would confirm anything.
     ids = np.setdiff1d(np.concatenate(files), [-1, *np.unique(code["image_path"])])
     return scanned.colours[ids[scanned.decoded[ids]][:64]].astype(np.float32)
 
@@ -448,7 +448,7 @@ def _judge_swap(
         bad = _distance(colours[vision], backgrounds) < _distance(colours[touch], backgrounds)
         whole = bool(bad.mean() >= _CERTAIN)
         return rows if whole else rows[bad], whole
-    # one photograph may serve many rows
+    # one RGB image may serve many rows
     each = [colours[np.unique(files)] for files in (touch, vision)]
     centre, other = (np.median(part, axis=0)[None] for part in each)
     spreads = [
@@ -472,7 +472,7 @@ def _distance(colours: np.ndarray, centres: np.ndarray) -> np.ndarray:
 
 
 def swapped_folders(manifest: Manifest, scanned: Scan) -> Iterator[Finding]:
-    """Yield data sets and rows whose touch images and photographs look swapped."""
+    """Yield data sets and rows whose touch images and RGB images look swapped."""
     for verdict in swap_verdicts(manifest, scanned):
         name = (
             f"dataset {shown(verdict.dataset)}" if verdict.dataset else "the rows without a dataset"
@@ -483,7 +483,7 @@ def swapped_folders(manifest: Manifest, scanned: Scan) -> Iterator[Finding]:
             else "suspected from the colours; look at some"
         )
         what = (
-            "all touch images and photographs are"
+            "all touch images and RGB images are"
             if verdict.whole
             else f"{verdict.swapped.size} rows are"
         )

@@ -3,7 +3,7 @@ them.
 
 * OUT/manifest.parquet: the manifest with paths such as `touch/00000.zip/17` (entry 17)
 * OUT/touch/00000.zip: touch images by sequence and frame
-* OUT/shared/: photographs and backgrounds, each stored once
+* OUT/shared/: RGB images and backgrounds, each stored once
 * OUT/field/: field files
 * OUT/SHA256SUMS: checksums for `sha256sum -c`
 * OUT/README.md: the licences

@@ -31,7 +31,7 @@ from anytouch_jax.datasets.scan import EXAMPLES, OK, STATES, Finding, Level, Sca
 from anytouch_jax.errors import UserError
 from anytouch_jax.shown import shown_short
 
-_SHARES = ("image_path", "text", "touch", "object", "background_path", "license")
+_FRACTIONS = ("image_path", "text", "touch", "object", "background_path", "license")
 _LISTED = 1000  # rows of a finding that are written to JSON
 _FRAME = ("dataset", "sensor", "unit", "sequence", "frame_index", "split")
 _LEARNING = SPLITS[:3]  # the splits that must not share anything: train, val, test
@@ -75,7 +75,7 @@ class Commercial(NamedTuple):
 class VerifyReport:
     """The result of `verify`.
 
-    `shares` has, by dataset and column, the share of rows with a value; `labels` counts.
+    `fractions` has, by dataset and column, the fraction of rows with a value; `labels` counts.
     """
 
     rows: int
@@ -83,7 +83,7 @@ class VerifyReport:
     decoded: bool
     findings: tuple[Finding, ...]
     licences: tuple[Licence, ...]
-    shares: dict[str, dict[str, float]]
+    fractions: dict[str, dict[str, float]]
     splits: dict[str, int]
     labels: dict[str, int]
     split_hash: str
@@ -108,7 +108,7 @@ class VerifyReport:
             "split_hash",
             "splits",
             "labels",
-            "shares",
+            "fractions",
         )
         report: dict[str, Any] = {name: getattr(self, name) for name in names}
         report["licences"] = [licence._asdict() for licence in self.licences]
@@ -143,9 +143,9 @@ class VerifyReport:
                 0 < len(one.examples) < len(one.files)
             )
         lines += ["" if self.findings else "No fault was found.\n"]
-        lines += _table("dataset", *_SHARES)
-        for name, share in self.shares.items():
-            lines += _row(name, *(f"{share[column]:.0%}" for column in _SHARES))
+        lines += _table("dataset", *_FRACTIONS)
+        for name, fraction in self.fractions.items():
+            lines += _row(name, *(f"{fraction[column]:.0%}" for column in _FRACTIONS))
         lines += ["", *_table("licence", "commercial", "rows", "datasets")]
         for licence in self.licences:
             use = {YES: "yes", NO: "no"}.get(licence.commercial, "unknown")
@@ -184,8 +184,8 @@ def verify(
         for entry in pc.value_counts(manifest.table["split"]).to_pylist()
     }
     splits = {name: counts[name] for name in SPLITS if name in counts}
-    present = {name: manifest.present(name) for name in _SHARES}
-    shares = {
+    present = {name: manifest.present(name) for name in _FRACTIONS}
+    fractions = {
         str(manifest.value(rows[0], "dataset") or "-"): {
             name: float(has[rows].mean()) for name, has in present.items()
         }
@@ -199,7 +199,7 @@ def verify(
         decode,
         tuple(findings),
         licences(manifest),
-        shares,
+        fractions,
         splits,
         labels,
         split_hash(manifest),
@@ -354,7 +354,7 @@ def _background_forms(manifest: Manifest, scanned: Scan) -> Iterator[Finding]:
 
 def _duplicates(manifest: Manifest, scanned: Scan) -> Iterator[Finding]:
     """Yield touch images that occur more than once, and touch images that are also the row's
-    photograph.
+    RGB image.
     """
     same = content_ids(scanned)
     repeats = repeated_rows(manifest, same)
@@ -369,9 +369,9 @@ def _duplicates(manifest: Manifest, scanned: Scan) -> Iterator[Finding]:
     )
     if "image_path" in scanned.files.code:
         rows = np.flatnonzero(same == content_ids(scanned, "image_path"))
-        words = "rows whose touch image and photograph are the same"
+        words = "rows whose touch image and RGB image are the same"
         yield from finding(
-            manifest, "touch_is_picture", "error", rows, words, "path", column="image_path"
+            manifest, "touch_is_image", "error", rows, words, "path", column="image_path"
         )
 
 
@@ -536,7 +536,7 @@ _FILE_CHECKS = (
     _background_forms,
     _duplicates,
     scans.swapped_folders,
-    scans.picture_faults,
+    scans.image_faults,
 )
 
 
@@ -558,8 +558,8 @@ class Repaired(NamedTuple):
 def repair(manifest: Manifest, report: VerifyReport, *, swap: Collection[str] = ()) -> Repaired:
     """Make the repairs that need no guess, based on the `report` of this manifest.
 
-    Rows with an unusable touch image and repeated rows are dropped. An unusable photograph,
-    background or field file becomes null. Touch images and photographs are exchanged in datasets
+    Rows with an unusable touch image and repeated rows are dropped. An unusable RGB image,
+    background or field file becomes null. Touch images and RGB images are exchanged in datasets
     that a background image confirms to be swapped as a whole, and in those named in `swap`. Raises
     UserError if no touch image is usable, and for an unknown name in `swap`.
     """
@@ -619,7 +619,7 @@ def _empty_cells(manifest: Manifest, column: str, rows: np.ndarray) -> Manifest:
 def _exchange(
     manifest: Manifest, report: VerifyReport, swap: Collection[str], done: list[str]
 ) -> tuple[Manifest, np.ndarray]:
-    """Return the manifest with touch image and photograph exchanged where needed, and which rows
+    """Return the manifest with touch image and RGB image exchanged where needed, and which rows
     those are.
     """
     exchanged = np.zeros(len(manifest), bool)
@@ -629,8 +629,8 @@ def _exchange(
             exchanged[verdict.rows] = True
             exchanged |= _background_rows(manifest, verdict.rows)
             done.append(
-                f"exchanged touch image and photograph in {verdict.rows.size} rows of dataset "
-                f"{verdict.dataset!r}: its photographs resemble the background frames, its touch "
+                f"exchanged touch image and RGB image in {verdict.rows.size} rows of dataset "
+                f"{verdict.dataset!r}: its RGB images resemble the background frames, its touch "
                 "images do not"
             )
     if swap:
@@ -639,7 +639,7 @@ def _exchange(
         exchanged |= chosen
         rows = int(chosen.sum())
         done.append(
-            f"exchanged touch image and photograph in {rows} rows of {', '.join(sorted(swap))}, as "
+            f"exchanged touch image and RGB image in {rows} rows of {', '.join(sorted(swap))}, as "
             "requested"
         )
     if not exchanged.any():
@@ -653,19 +653,19 @@ def _exchange(
     result = replace_column(
         result, "image_path", pa.array(np.where(exchanged, touch, image), pa.string())
     )
-    # its folder now holds photographs
-    photographs = exchanged & scans.in_touch_folder(manifest, "background_path")
-    if photographs.any():
-        result = _empty_cells(result, "background_path", photographs)
+    # its folder now holds RGB images
+    rgb_images = exchanged & scans.in_touch_folder(manifest, "background_path")
+    if rgb_images.any():
+        result = _empty_cells(result, "background_path", rgb_images)
         done.append(
-            f"emptied background_path in {int(photographs.sum())} of them: it lay among the "
-            "photographs"
+            f"emptied background_path in {int(rgb_images.sum())} of them: it lay among the "
+            "RGB images"
         )
     return result, exchanged
 
 
 def _background_rows(manifest: Manifest, rows: np.ndarray) -> np.ndarray:
-    """Return the background rows with a photograph of the dataset and sensor of `rows`.
+    """Return the background rows with an RGB image of the dataset and sensor of `rows`.
 
     They are swapped too.
     """

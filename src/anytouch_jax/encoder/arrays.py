@@ -23,7 +23,7 @@ Array = npt.NDArray[Any]
 Params = dict[str, Any]
 Size = tuple[int, int]  # height and width, pixels
 Pooling = Literal["class", "mean", "both"]
-Join = Literal["mean", "sum", "concat"]
+Aggregation = Literal["mean", "sum", "concat"]
 # What computes the features of touch. "auto" chooses among them, see `export.export.cached_export`.
 Engine = Literal["xla", "onnxruntime", "openvino"]
 EngineChoice = Engine | Literal["auto"]

@@ -22,7 +22,7 @@ from anytouch_jax.config import UNIVERSAL, Config, ModelConfig, check_spelling
 from anytouch_jax.data.images import to_rgb
 from anytouch_jax.data.transforms import Flip, subtract_background, touch_evaluation
 from anytouch_jax.encoder import arrays
-from anytouch_jax.encoder.arrays import BATCH, EngineChoice, Join, Log, Params, Pooling, warn
+from anytouch_jax.encoder.arrays import BATCH, Aggregation, EngineChoice, Log, Params, Pooling, warn
 from anytouch_jax.encoder.features import as_clips as as_clips
 from anytouch_jax.encoder.features import bare_model as bare_model
 from anytouch_jax.encoder.features import check_choices as check_choices
@@ -35,7 +35,12 @@ from anytouch_jax.encoder.measured import Fields, Measure, missing, open_measure
 from anytouch_jax.encoder.sensor_words import resolve_sensor
 from anytouch_jax.encoder.towers import PART_NAMES, Towers
 from anytouch_jax.errors import UserError, refuse_forked
+from anytouch_jax.renamed import keywords
 from anytouch_jax.shown import count_of, described, leaves
+
+# Touches at once up to which onnxruntime is faster than XLA (`experiments.benchmarks.batches`). An
+# engine fuses a small network into fewer calls, and XLA has the faster products of large matrices.
+FEW = 4
 
 
 @dataclass(frozen=True, repr=False)
@@ -82,7 +87,7 @@ class Encoder(Towers):
         if count and towers:
             parameters += " of the touch encoder"
         if self.needs_background:
-            background = "needed, the picture of the untouched gel"
+            background = "needed, the image of the untouched gel"
         elif self.subtracts:
             background = "subtracted if it is given"
         else:
@@ -98,7 +103,7 @@ class Encoder(Towers):
                 f"{model.frames} or more"
             ),
             "background": background,
-            "features": str(model.embed),
+            "features": str(model.embed + model.sight),
             "sensors": sensors,
         }
 
@@ -165,12 +170,12 @@ class Encoder(Towers):
     def input_form(self, frames: int) -> dict[str, Any]:
         """Return what an exported encoder says about its input.
 
-        It says how a picture becomes a frame of it, too.
+        It says how an image becomes a frame of it, too.
         """
         side = self.config.model.image_size
         difference = ""
         resize = (
-            f"the whole picture to {side} x {side}, its shape not kept: OpenCV's INTER_AREA where "
+            f"the whole image to {side} x {side}, its shape not kept: OpenCV's INTER_AREA where "
             f"the shorter side is above {side} pixels, else INTER_LINEAR"
         )
         if self.subtracts:
@@ -197,14 +202,15 @@ class Encoder(Towers):
         """Whether `traceable` gives it as a function of jax."""
         return True
 
+    @keywords(join="aggregation")
     def traceable(
-        self, pooling: Pooling = "class", join: Join = "mean"
+        self, pooling: Pooling = "class", aggregation: Aggregation = "mean"
     ) -> Callable[..., jax.Array]:
         """Return the function from params, touches and sensor rows to features (B, E).
 
         Touches are u8 (B, T, H, W, 3), rows (B,).
         """
-        return partial(touch_features, net=self.net, pooling=pooling, join=join)
+        return partial(touch_features, net=self.net, pooling=pooling, aggregation=aggregation)
 
     def prepare(self, frame: np.ndarray, background: np.ndarray | None = None) -> np.ndarray:
         """Return a frame u8 (h, w, 3) as the network reads it.
@@ -214,24 +220,25 @@ class Encoder(Towers):
         frames = [frame] if background is None else subtract_background([frame], background)
         return touch_evaluation(frames, self.config.model.image_size)[0]
 
+    @keywords(join="aggregation")
     def encode_touch(
         self,
         frames: Any,
         sensor: str | Sequence[str] | np.ndarray = UNIVERSAL,
         *,
         pooling: Pooling = "class",
-        join: Join = "mean",
+        aggregation: Aggregation = "mean",
     ) -> np.ndarray:
         """Return features f32 (B, E) of touches, not unit-norm.
 
         Args:
             frames: u8 RGB (B, T, H, W, 3), (B, H, W, 3) or (H, W, 3). H and W are the model's size,
                 see `preprocess`. T is 1 (a still), 3 (a clip) or more: then features of segments of
-                three are joined by `join`.
+                three are joined by `aggregation`.
             sensor: one name, names (B,), or rows i32 (B,).
             pooling: the class token (which alignment trains), the mean of the patch tokens, or both
                 (B, 2E).
-            join: the temporal aggregation of segments.
+            aggregation: the temporal aggregation of segments.
 
         Raises:
             UserError: touches of another form, or another sensor or pooling than there are.
@@ -248,17 +255,28 @@ class Encoder(Towers):
                 "encoder.preprocess(frame)"
             )
         arrays.check_frames(self.config.model, frames.shape[1])
-        check_choices(pooling, join)
-        run = self.exported(frames.shape[1], pooling) if len(frames) else None
+        check_choices(pooling, aggregation)
+        run = None
+        if len(frames) and self.uses_engine(len(frames)):
+            run = self.exported(frames.shape[1], pooling)
         if run is not None:
             return run(frames, self._rows(sensor, len(frames)))
-        return self._encode(frames, sensor, self.traceable(pooling, join), (pooling, join))
+        return self._encode(
+            frames, sensor, self.traceable(pooling, aggregation), (pooling, aggregation)
+        )
 
     def _rows(self, sensor: Any, count: int) -> np.ndarray:
         """Return rows i32 (count,) of a sensor, see `encode_touch`."""
         return arrays.rows_of_sensors(
             sensor, count, self.sensor_row, len(self.config.model.sensors)
         )
+
+    def uses_engine(self, count: int) -> bool:
+        """Return whether `count` touches at once are computed by an engine, where there is one.
+
+        "auto" leaves more than FEW to XLA, and an engine that was named computes all.
+        """
+        return self.engine not in ("xla", "auto") or (self.engine == "auto" and count <= FEW)
 
     def exported(self, frames: int, pooling: Pooling = "class", *, fields: bool = False) -> Any:
         """Return the export on its engine for touches of `frames` frames.
@@ -308,7 +326,7 @@ class Encoder(Towers):
                 T, h, w, 3), whose last frame is measured. A still shows little of slip.
             background: the untouched gel.
             sensor: its name, or the folder NAME.sensor of a fitted one.
-            width_mm: the mm that the picture's width shows. A name that is not in
+            width_mm: the mm that the image's width shows. A name that is not in
                 `fields.measure.GELS` needs it. Without it lengths are fractions of that width, and
                 there is no force.
             log: takes a sentence on each fault of the frames.
@@ -357,7 +375,7 @@ class Encoder(Towers):
         Args:
             sensor: its name, or the folder NAME.sensor of a fitted one.
             background: the untouched gel, RGB (h, w, 3), as the camera takes it.
-            width_mm: the mm that the picture's width shows, see `measure`.
+            width_mm: the mm that the image's width shows, see `measure`.
             log: takes a sentence on each fault of the first frame.
             rotate: degrees by which frames are turned clockwise, as `Preprocess` does.
             flip: how they are mirrored after that.
@@ -387,10 +405,10 @@ class Encoder(Towers):
         Args:
             clips: u8 (B, T, H, W, 3).
             rows: (B,), those of the sensor.
-            aspect: (B,), logarithms of the pictures' height over width.
+            aspect: (B,), logarithms of the images' height over width.
             pooling: that of the features.
         """
-        if self.measures:
+        if self.measures and self.uses_engine(len(clips)):
             run = self.exported(clips.shape[1], pooling, fields=True)
             if run is not None:
                 return run.measure(np.asarray(clips), np.asarray(rows), np.asarray(aspect))

@@ -180,6 +180,8 @@ class CalibrationRows(NamedTuple):
         sensors: (N,), sensors of all rows.
         fit: row numbers.
         val: row numbers.
+        tuned: the encoder was trained on the rows of `fit`, whose features are thus no sample of
+            those to come.
     """
 
     logits: Array
@@ -190,6 +192,7 @@ class CalibrationRows(NamedTuple):
     sensors: Array
     fit: Array
     val: Array
+    tuned: bool = False
 
 
 def calibrate(
@@ -226,27 +229,55 @@ def calibrate(
     # and Wasserman (2019): every class whose score is at most the limit.
     set_limit = conformal_limit(1 - p[np.arange(len(truth)), truth], held_out, coverage)
 
+    limits = {"temperature": temperature, "coverage": coverage, "set_limit": set_limit}
+    return Calibration(
+        recordings=len(np.unique(held_out)), **limits, **known_touches(rows, x, false_alarms)
+    )
+
+
+def calibrate_number(
+    rows: CalibrationRows, x: Array, *, coverage: float, false_alarms: float
+) -> Calibration:
+    """Return the calibration of a head of numbers, whose `set_limit` is half of an interval.
+
+    The errors of held-out groups are the scores of split conformal prediction (Lei et al.,
+    "Distribution-free predictive inference for regression", 2018).
+
+    Args:
+        rows: `logits` (n, 1) are predictions, and `y` f64 (n,) the truth.
+        x: f32 (N, d), `rows.features` scaled as the head does.
+        coverage: the probability with which an interval shall hold the truth.
+        false_alarms: the probability with which a known touch may be called novel.
+    """
+    errors = np.abs(rows.logits[:, 0] - rows.y)
+    half = conformal_limit(errors, rows.held_out, coverage)
+    limits = {"temperature": 1.0, "coverage": coverage, "set_limit": half}
+    return Calibration(
+        recordings=len(np.unique(rows.held_out)), **limits, **known_touches(rows, x, false_alarms)
+    )
+
+
+def known_touches(rows: CalibrationRows, x: Array, false_alarms: float) -> dict[str, Any]:
+    """Return the fields of a calibration that tell new touches from known ones.
+
+    `x` f32 (N, d) are the scaled features.
+    """
     fit_groups = rows.groups[rows.fit]
     owners = rows.groups[rows.val]
     whitening, chosen, references = reference_space(x[rows.fit], fit_groups)
     scores = novelty_scores(x[rows.val] @ whitening, references, owners, fit_groups[chosen])
     # Fewer than five groups are expected above the limit, so it would be noise. Rows of `fit` help,
     # if each is scored by groups that it does not belong to.
-    if len(np.unique(owners)) * false_alarms < 5:
+    if len(np.unique(owners)) * false_alarms < 5 and not rows.tuned:
         scores = np.concatenate([scores, left_out_scores(x[rows.fit], fit_groups)])
         owners = np.concatenate([owners, fit_groups])
-    novelty_limit = conformal_limit(scores, owners, 1 - false_alarms)
-    return Calibration(
-        temperature=temperature,
-        coverage=coverage,
-        set_limit=set_limit,
-        false_alarms=false_alarms,
-        novelty_limit=novelty_limit,
-        recordings=len(np.unique(held_out)),
-        whitening=whitening,
-        references=references,
-        sensors=rows.sensors[rows.fit[chosen]],
-    )
+    return {
+        "false_alarms": false_alarms,
+        "novelty_limit": conformal_limit(scores, owners, 1 - false_alarms),
+        "whitening": whitening,
+        "references": references,
+        "sensors": rows.sensors[rows.fit[chosen]],
+    }
 
 
 def probabilities(logits: Array, temperature: float = 1.0) -> Array:
@@ -325,8 +356,8 @@ def group_weights(groups: Array) -> Array:
     return 1 / (counts[ids] * len(counts))
 
 
-def conformal_limit(scores: Array, groups: Array, share: float) -> float:
-    """Return the limit that a score of a new group is at most with probability `share`.
+def conformal_limit(scores: Array, groups: Array, fraction: float) -> float:
+    """Return the limit that a score of a new group is at most with probability `fraction`.
 
     Groups have equal weight. Two limits are computed, and the lower one counts:
 
@@ -339,15 +370,15 @@ def conformal_limit(scores: Array, groups: Array, share: float) -> float:
     Args:
         scores: (n,), finite or infinite.
         groups: (n,).
-        share: the probability, between 0 and 1.
+        fraction: the probability, between 0 and 1.
 
     Raises:
-        UserError: a `share` outside 0..1, no scores, or NaN.
+        UserError: a `fraction` outside 0..1, no scores, or NaN.
     """
     scores = np.asarray(scores, np.float64)
     groups = np.asarray(groups)
-    if not isinstance(share, int | float | np.number) or not 0 < share < 1:
-        raise UserError(f"A coverage must lie between 0 and 1, not {share!r}.")
+    if not isinstance(fraction, int | float | np.number) or not 0 < fraction < 1:
+        raise UserError(f"A coverage must lie between 0 and 1, not {fraction!r}.")
     if not scores.size or scores.shape != groups.shape or np.isnan(scores).any():
         raise UserError(
             f"A limit needs scores (n,) without NaN and as many groups, not {scores.shape} "
@@ -361,7 +392,7 @@ def conformal_limit(scores: Array, groups: Array, share: float) -> float:
     mass = np.cumsum(weights)  # of all rows up to each
     # The further group takes 1 / (count + 1) of the mass, and lies behind all scores.
     with_one_more = mass * count / (count + 1)
-    place = int(np.searchsorted(with_one_more, share - _ROUNDING))
+    place = int(np.searchsorted(with_one_more, fraction - _ROUNDING))
     if place == len(scores):
         return np.inf
 
@@ -373,10 +404,10 @@ def conformal_limit(scores: Array, groups: Array, share: float) -> float:
     # The mass of the others up to each row, where the others alone are the whole.
     below = (mass - own) * count / max(count - 1, 1)
     # `level` is the mass of the others up to which a limit must reach, so that of all rows, weighed
-    # by group, `share` lie below the limit of their group.
+    # by group, `fraction` lie below the limit of their group.
     turn = np.argsort(below, kind="stable")
     covered = np.cumsum(weights[turn])
-    last = int(np.searchsorted(covered, share - _ROUNDING))
+    last = int(np.searchsorted(covered, fraction - _ROUNDING))
     level = below[turn][min(last + 1, len(turn) - 1)]
     by_others = int(np.searchsorted(mass, level - _ROUNDING))
     return float(scores[min(place, by_others)])

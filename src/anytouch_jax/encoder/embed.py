@@ -9,10 +9,10 @@ from typing import Literal
 import numpy as np
 import pyarrow as pa
 
-from anytouch_jax.data.background.rule import ADVICE, UnitGels
+from anytouch_jax.data.background.rule import ADVICE, Backgrounds
 from anytouch_jax.data.loading.samples import evaluation
 from anytouch_jax.data.manifest.manifest import Manifest
-from anytouch_jax.encoder.arrays import BATCH, Join, Log, Pooling, warn
+from anytouch_jax.encoder.arrays import BATCH, Aggregation, Log, Pooling, warn
 from anytouch_jax.encoder.arrays import run_in_batches as run_in_batches
 from anytouch_jax.encoder.index import Features as Features
 from anytouch_jax.encoder.index import TouchIndex as TouchIndex
@@ -36,7 +36,7 @@ class RowSettings:
     Attributes:
         frames: those of a touch. A row's clip is the `frames` frames that end at it.
         pooling: see `Encoder.encode_touch`.
-        join: the temporal aggregation of a long clip.
+        aggregation: the temporal aggregation of a long clip.
         batch: touches at a time.
         on_bad_sample: "skip" leaves out rows that cannot be read, and the first are logged.
         sensor_row: serves all rows, instead of their own sensors.
@@ -45,7 +45,7 @@ class RowSettings:
 
     frames: int = 1
     pooling: Pooling = "class"
-    join: Join = "mean"
+    aggregation: Aggregation = "mean"
     batch: int = BATCH
     on_bad_sample: Literal["error", "skip"] = "error"
     sensor_row: int | None = None
@@ -58,13 +58,13 @@ def embed_rows(  # noqa: PLR0913  the public call; `embed_with` takes the record
     rows: np.ndarray,
     frames: int = 1,
     pooling: Pooling = "class",
-    join: Join = "mean",
+    aggregation: Aggregation = "mean",
     *,
     batch: int = BATCH,
     on_bad_sample: Literal["error", "skip"] = "error",
     sensor_row: int | None = None,
     edit: Edit | None = None,
-    gels: UnitGels | None = None,
+    backgrounds: Backgrounds | None = None,
     log: Log = warn,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return row numbers i64 (n,) and features f32 (n, d) of manifest rows, see `embed_with`.
@@ -75,24 +75,24 @@ def embed_rows(  # noqa: PLR0913  the public call; `embed_with` takes the record
         rows: row numbers (m,), of which n can be embedded.
         frames: see `RowSettings`.
         pooling: see `RowSettings`.
-        join: see `RowSettings`.
+        aggregation: see `RowSettings`.
         batch: see `RowSettings`.
         on_bad_sample: see `RowSettings`.
         sensor_row: see `RowSettings`.
         edit: see `RowSettings`.
-        gels: pictures of the untouched gel, for an encoder that subtracts them.
+        backgrounds: images of the untouched gel, for an encoder that subtracts them.
         log: takes sentences.
     """
     settings = RowSettings(
         frames=frames,
         pooling=pooling,
-        join=join,
+        aggregation=aggregation,
         batch=batch,
         on_bad_sample=on_bad_sample,
         sensor_row=sensor_row,
         edit=edit,
     )
-    return embed_with(encoder, manifest, rows, settings, gels=gels, log=log)
+    return embed_with(encoder, manifest, rows, settings, backgrounds=backgrounds, log=log)
 
 
 def embed_with(
@@ -101,12 +101,12 @@ def embed_with(
     rows: np.ndarray,
     settings: RowSettings,
     *,
-    gels: UnitGels | None = None,
+    backgrounds: Backgrounds | None = None,
     log: Log = warn,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return row numbers i64 (n,) and features f32 (n, d) of manifest rows, each encoded once.
 
-    An unknown sensor gets the universal tokens, which is logged. Rows without a picture of the
+    An unknown sensor gets the universal tokens, which is logged. Rows without an image of the
     untouched gel are left out if the encoder needs one, and so are, with `on_bad_sample` "skip",
     rows that cannot be read.
 
@@ -115,8 +115,8 @@ def embed_with(
         manifest: the table.
         rows: row numbers (m,).
         settings: how they are embedded.
-        gels: pictures of the untouched gel, for an encoder that subtracts them. By default they are
-            those of the manifest.
+        backgrounds: images of the untouched gel, for an encoder that subtracts them. By default
+            they are those of the manifest.
         log: takes sentences.
 
     Raises:
@@ -124,10 +124,10 @@ def embed_with(
     """
     if not len(rows):
         raise UserError("there are no rows to embed; check the split and the filters")
-    if gels is None and encoder.subtracts:
-        gels = UnitGels(manifest)
-        log(gels.report(rows))
-    rows = rows_with_gel(encoder, gels, rows, log)
+    if backgrounds is None and encoder.subtracts:
+        backgrounds = Backgrounds(manifest)
+        log(backgrounds.report(rows))
+    rows = rows_with_gel(encoder, backgrounds, rows, log)
     if settings.sensor_row is None:
         # The loader asks for each row without a log, so that a name is reported once.
         for name in sorted(set(manifest.text_column("sensor")[rows])):
@@ -153,7 +153,7 @@ def embed_with(
             prepare=encoder.prepare,
             like=encoder.blank,
             skipped=skipped,
-            gels=gels,
+            backgrounds=backgrounds,
         )
         for row_ids, part in batches:
             ids.append(row_ids)
@@ -168,7 +168,9 @@ def embed_with(
         clips, sensor = part
         if settings.sensor_row is not None:
             sensor = np.full_like(sensor, settings.sensor_row)
-        return encoder.encode_touch(clips, sensor, pooling=settings.pooling, join=settings.join)
+        return encoder.encode_touch(
+            clips, sensor, pooling=settings.pooling, aggregation=settings.aggregation
+        )
 
     values = run_in_batches(
         encode, tracked(touches(), "frames embedded", len(rows)), config.data.batch_size
@@ -190,7 +192,7 @@ def embed_frames(
     *,
     length: int = 1,
     pooling: Pooling = "class",
-    join: Join = "mean",
+    aggregation: Aggregation = "mean",
     batch: int = BATCH,
 ) -> Features:
     """Return features of every clip of consecutive frames, keyed by the place of its last frame.
@@ -203,7 +205,7 @@ def embed_frames(
         preprocess: `encoder.preprocess` by default.
         length: frames of a clip.
         pooling: see `Encoder.encode_touch`.
-        join: the temporal aggregation of a long clip.
+        aggregation: the temporal aggregation of a long clip.
         batch: clips at a time.
 
     Raises:
@@ -230,7 +232,7 @@ def embed_frames(
 
     def encode(clips: np.ndarray) -> np.ndarray:
         rows = np.full(len(clips), sensor_row)
-        return encoder.encode_touch(clips, rows, pooling=pooling, join=join)
+        return encoder.encode_touch(clips, rows, pooling=pooling, aggregation=aggregation)
 
     values = run_in_batches(encode, clips(), batch)
     if not ends:
@@ -246,23 +248,23 @@ def embed_frames(
 
 
 def rows_with_gel(
-    encoder: TouchEncoder, gels: UnitGels | None, rows: np.ndarray, log: Log = warn
+    encoder: TouchEncoder, backgrounds: Backgrounds | None, rows: np.ndarray, log: Log = warn
 ) -> np.ndarray:
     """Return those of `rows` that have an untouched gel, if the encoder needs one.
 
     Raises UserError if none has one.
     """
-    if not encoder.needs_background or gels is None:
+    if not encoder.needs_background or backgrounds is None:
         return rows
-    has = gels.has(rows)
+    has = backgrounds.has(rows)
     if not has.any():
         raise UserError(
-            f"{encoder.source} subtracts the untouched gel. {len(rows)} rows have no picture of "
+            f"{encoder.source} subtracts the untouched gel. {len(rows)} rows have no image of "
             f"it, and too few frames to estimate it. {ADVICE}"
         )
     if not has.all():
         log(
-            f"{(~has).sum()} of {len(rows)} rows have no picture of the untouched gel, and are "
+            f"{(~has).sum()} of {len(rows)} rows have no image of the untouched gel, and are "
             "left out"
         )
     return rows[has]

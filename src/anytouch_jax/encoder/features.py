@@ -16,7 +16,7 @@ import numpy as np
 from anytouch_jax.batch import FieldOutput
 from anytouch_jax.config import Config, ModelConfig
 from anytouch_jax.encoder import arrays
-from anytouch_jax.encoder.arrays import Join, Params, Pooling
+from anytouch_jax.encoder.arrays import Aggregation, Params, Pooling
 from anytouch_jax.errors import UserError, refuse_forked
 from anytouch_jax.nn.attention import usable
 from anytouch_jax.nn.functional import Net, build
@@ -50,15 +50,24 @@ def as_clips(frames: Any) -> np.ndarray:
     return frames
 
 
-def check_choices(pooling: Pooling, join: Join) -> None:
+def check_choices(pooling: Pooling, aggregation: Aggregation) -> None:
     """Raise UserError for another pooling or join than there are."""
-    for name, value, kind in (("pooling", pooling, Pooling), ("join", join, Join)):
+    for name, value, kind in (
+        ("pooling", pooling, Pooling),
+        ("aggregation", aggregation, Aggregation),
+    ):
         if value not in get_args(kind):
             raise UserError(f"{name} is one of {', '.join(get_args(kind))}, not {value!r}")
 
 
 def touch_features(
-    params: Params, clips: jax.Array, sensor: jax.Array, *, net: Net, pooling: Pooling, join: Join
+    params: Params,
+    clips: jax.Array,
+    sensor: jax.Array,
+    *,
+    net: Net,
+    pooling: Pooling,
+    aggregation: Aggregation,
 ) -> jax.Array:
     """Return features f32 (B, E): a traceable `encode_touch`.
 
@@ -68,16 +77,19 @@ def touch_features(
         sensor: rows (B,) of the sensor table.
         net: the network of these parameters.
         pooling: see `Encoder.encode_touch`.
-        join: see `Encoder.encode_touch`.
+        aggregation: see `Encoder.encode_touch`.
     """
-    check_choices(pooling, join)
+    check_choices(pooling, aggregation)
     clips = normalise_touch(clips)
     if pooling == "class":
-        return net.encode_touch(params, clips, sensor, join).astype(jnp.float32)
-    # XLA drops the class token where it is not used, so "mean" does not cost more than it needs.
-    both = net.encode_poolings(params, clips, sensor, join)
-    used = both if pooling == "both" else both[1:]
-    return jnp.concatenate(used, axis=-1).astype(jnp.float32)
+        values = [net.encode_touch(params, clips, sensor, aggregation)]
+    else:
+        # XLA drops the class token where it is not used, so "mean" costs no more than it needs.
+        both = net.encode_poolings(params, clips, sensor, aggregation)
+        values = [*(both if pooling == "both" else both[1:])]
+    if net.model.sight:
+        values.append(net.encode_sight(params, clips, sensor, aggregation))
+    return jnp.concatenate(values, axis=-1).astype(jnp.float32)
 
 
 def features_and_fields(
@@ -95,13 +107,16 @@ def features_and_fields(
         params: those of touch encoder and fields.
         clips: u8 (B, T, H, W, 3).
         sensor: rows (B,) of the sensor table.
-        aspect: (B,), logarithms of the pictures' height over width.
+        aspect: (B,), logarithms of the images' height over width.
         net: the network of these parameters.
         pooling: that of the features.
     """
     check_choices(pooling, "mean")
-    token, mean, out = net.encode_and_measure(params, normalise_touch(clips), sensor, aspect)
-    values = {"class": (token,), "mean": (mean,), "both": (token, mean)}[pooling]
+    clips = normalise_touch(clips)
+    token, mean, out = net.encode_and_measure(params, clips, sensor, aspect)
+    values = {"class": [token], "mean": [mean], "both": [token, mean]}[pooling]
+    if net.model.sight:
+        values.append(net.encode_sight(params, clips, sensor))
     wide = jax.tree.map(lambda value: value.astype(jnp.float32), out)
     return jnp.concatenate(values, axis=-1).astype(jnp.float32), wide
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from anytouch_jax.data.background.rule import gel_arrays, gels_of_arrays
+from anytouch_jax.data.background.rule import background_arrays, backgrounds_of_arrays
 from anytouch_jax.encoder.arrays import Array, unit_rows
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_path, read_arrays
@@ -38,7 +38,7 @@ class Features:
         keys: further arrays (n,) by name.
         skipped: how many rows have no features.
         predictions: arrays (n, ...) of a head by name.
-        gels: pictures of the untouched gel by unit.
+        backgrounds: images of the untouched gel by unit.
     """
 
     values: np.ndarray
@@ -46,7 +46,7 @@ class Features:
     keys: dict[str, np.ndarray]
     skipped: int = 0
     predictions: dict[str, np.ndarray] = field(default_factory=dict)
-    gels: dict[str, np.ndarray] = field(default_factory=dict)
+    backgrounds: dict[str, np.ndarray] = field(default_factory=dict)
 
 
 def save_npz(path: str | Path, features: Features, metadata: dict[str, str]) -> None:
@@ -58,7 +58,7 @@ def save_npz(path: str | Path, features: Features, metadata: dict[str, str]) -> 
     arrays |= features.predictions
     arrays |= {f"key/{name}": values for name, values in features.keys.items()}
     arrays |= {f"about/{name}": np.asarray(value) for name, value in metadata.items()}
-    arrays |= gel_arrays(features.gels)
+    arrays |= background_arrays(features.backgrounds)
     with atomic_path(path) as part, open(part, "wb") as file:
         np.savez(file, **arrays)
 
@@ -70,7 +70,7 @@ def read_npz(path: str | Path) -> tuple[Features, dict[str, str]]:
     """
     try:
         arrays = read_arrays(path)
-        gels = gels_of_arrays(arrays)
+        backgrounds = backgrounds_of_arrays(arrays)
     except (OSError, ValueError, KeyError) as error:
         raise UserError(f"{path} is not a features file of `anytouch embed`: {error}") from None
     nothing = np.zeros(0, str)
@@ -93,7 +93,7 @@ def read_npz(path: str | Path) -> tuple[Features, dict[str, str]]:
             f"{path}: its keys (key/path and others) must be one for each of the {len(rows)} rows."
         )
     about = {name: str(array)[:_LETTERS] for name, array in _named(arrays, "about/").items()}
-    return Features(values, rows, keys, gels=gels), about
+    return Features(values, rows, keys, backgrounds=backgrounds), about
 
 
 def _named(arrays: dict[str, Array], start: str) -> dict[str, Array]:
@@ -151,7 +151,7 @@ class TouchIndex:
         about: metadata.
         source: the name of the index, for sentences.
         cells: FAISS's inverted file for approximate search, or None.
-        gels: pictures of the untouched gel by unit.
+        backgrounds: images of the untouched gel by unit.
     """
 
     values: Array
@@ -160,7 +160,7 @@ class TouchIndex:
     about: dict[str, str]
     source: str = "the index"
     cells: Any = field(default=None, repr=False)
-    gels: dict[str, Array] = field(default_factory=dict)
+    backgrounds: dict[str, Array] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         names = [name for name in ("encoder", "pooling", "frames", "input") if name in self.about]
@@ -215,7 +215,9 @@ def load_index(path: str | Path, *, approximate: bool = False) -> TouchIndex:
     features, about = read_npz(path)
     unit = unit_rows(features.values).astype(np.float32)
     cells = _cells(unit) if approximate else None
-    return TouchIndex(unit, features.rows, features.keys, about, str(path), cells, features.gels)
+    return TouchIndex(
+        unit, features.rows, features.keys, about, str(path), cells, features.backgrounds
+    )
 
 
 def _cells(values: Array) -> Any:

@@ -17,12 +17,18 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from anytouch_jax import renamed
 from anytouch_jax.config import UNIVERSAL, Config, check_spelling
-from anytouch_jax.data.background.rule import RunningGel, estimate_background, other_unit, same_unit
+from anytouch_jax.data.background.rule import (
+    RunningBackground,
+    estimate_background,
+    other_unit,
+    same_unit,
+)
 from anytouch_jax.data.images import to_rgb
 from anytouch_jax.data.transforms import Flip, orient_frame
 from anytouch_jax.encoder import arrays
-from anytouch_jax.encoder.arrays import Join, Log, Params, Pooling, warn
+from anytouch_jax.encoder.arrays import Aggregation, Log, Params, Pooling, warn
 from anytouch_jax.encoder.measured import missing
 from anytouch_jax.encoder.sensor_words import resolve_sensor
 from anytouch_jax.errors import UserError
@@ -63,9 +69,10 @@ class TouchEncoder(ABC):
     def prepare(self, frame: np.ndarray, background: np.ndarray | None = None) -> np.ndarray:
         """Return a frame RGB u8 (h, w, 3) as the network reads it.
 
-        `background` is the untouched gel, of the frame's size, if there is a picture of it.
+        `background` is the untouched gel, of the frame's size, if there is an image of it.
         """
 
+    @renamed.keywords(join="aggregation")
     @abstractmethod
     def encode_touch(
         self,
@@ -73,7 +80,7 @@ class TouchEncoder(ABC):
         sensor: str | Sequence[str] | np.ndarray = UNIVERSAL,
         *,
         pooling: Pooling = "class",
-        join: Join = "mean",
+        aggregation: Aggregation = "mean",
     ) -> np.ndarray:
         """Return features f32 (B, E) of prepared frames (B, T, ...).
 
@@ -82,7 +89,7 @@ class TouchEncoder(ABC):
             sensor: one name, names (B,), or rows i32 (B,) of the table of sensors.
             pooling: the class token, the mean of the patch tokens, or both (B, 2E). An encoder that
                 has only one kind of feature may ignore it.
-            join: the temporal aggregation of the segments of a long clip.
+            aggregation: the temporal aggregation of the segments of a long clip.
         """
 
     # What most encoders leave as it is.
@@ -103,9 +110,15 @@ class TouchEncoder(ABC):
         return self.config.data.background == "subtract"
 
     @property
-    def gels(self) -> dict[str, np.ndarray]:
-        """Pictures of the untouched gel by unit, of an encoder that stores some."""
+    def backgrounds(self) -> dict[str, np.ndarray]:
+        """Images of the untouched gel by unit, of an encoder that stores some."""
         return {}
+
+    @property
+    def gels(self) -> dict[str, np.ndarray]:
+        """The old name of `backgrounds`."""
+        renamed.warn("encoder.gels", "encoder.backgrounds")
+        return self.backgrounds
 
     @property
     def contract(self) -> str:
@@ -152,7 +165,10 @@ class TouchEncoder(ABC):
         """
         return None
 
-    def traceable(self, pooling: Pooling = "class", join: Join = "mean") -> Callable[..., Any]:
+    @renamed.keywords(join="aggregation")
+    def traceable(
+        self, pooling: Pooling = "class", aggregation: Aggregation = "mean"
+    ) -> Callable[..., Any]:
         """Return the function from params, touches (B, T, ...) and sensor rows (B,) to features."""
         raise UserError(f"{self.source} has no function for jax; call its encode_touch")
 
@@ -179,7 +195,7 @@ class TouchEncoder(ABC):
         """
         if self.needs_background and background is None:
             raise UserError(
-                f"{self.source} subtracts the untouched gel. Give its picture, or that of some "
+                f"{self.source} subtracts the untouched gel. Give its image, or that of some "
                 "frames: encoder.preprocess(frame, at.estimate_background(frames)). Or prepare all "
                 "frames with at.Preprocess(encoder, frames=frames)."
             )
@@ -190,9 +206,9 @@ class Preprocess:
     """Frames of one sensor in the form that an encoder was trained on.
 
     They are turned by `rotate` degrees, mirrored by `flip` (`data.transforms.orient_frame`) and
-    resized. For an encoder that `subtracts`, the `background` (a picture of the untouched gel) is
+    resized. For an encoder that `subtracts`, the `background` (an image of the untouched gel) is
     subtracted first, or the `estimate_background` of `frames`. Without either, the first frame
-    chooses among the `known` pictures of a head. If none is of its unit, `log` gets a warning, and
+    chooses among the `known` images of a head. If none is of its unit, `log` gets a warning, and
     the frames so far give a running estimate, as for an encoder that needs a background.
 
     >>> features = encoder.encode_touch(Preprocess(encoder, frames=frames)(camera.read()), "digit")
@@ -217,7 +233,7 @@ class Preprocess:
         self._orient = partial(orient_frame, rotate=rotate, flip=flip)
         self._known = dict(known or {})
         self._log = log
-        self._running = RunningGel() if encoder.needs_background or self._known else None
+        self._running = RunningBackground() if encoder.needs_background or self._known else None
         self._background = None if frames is None else estimate_background(frames)
         if background is not None:
             self._background = to_rgb(
@@ -228,12 +244,12 @@ class Preprocess:
 
     @property
     def background(self) -> np.ndarray | None:
-        """The picture of the untouched gel, RGB u8 (h, w, 3), as the camera takes it.
+        """The image of the untouched gel, RGB u8 (h, w, 3), as the camera takes it.
 
         It is None if there is none (yet).
         """
         if self._background is None and self._running:
-            return self._running.picture
+            return self._running.image
         return self._background
 
     @property
@@ -247,7 +263,7 @@ class Preprocess:
         if gel is None:
             known = "the first frame"
         else:
-            known = f"a picture of {gel.shape[1]} x {gel.shape[0]}"
+            known = f"an image of {gel.shape[1]} x {gel.shape[0]}"
         used = f"minus {known}" if self._subtracts else "without a background"
         turned = " ".join(f"{name}={value!r}" for name, value in self._orient.keywords.items())
         return f"Preprocess(frames of {getattr(encoder, 'source', 'an encoder')}, {used}, {turned})"
@@ -272,7 +288,7 @@ class Preprocess:
         return self._prepare(frame, self._gel[1])
 
     def _choose_known(self, frame: np.ndarray) -> None:
-        """Take the known picture of the unit that shows in the first frame, or log that none is."""
+        """Take the known image of the unit that shows in the first frame, or log that none is."""
         known = self._known
         self._known = {}
         gel, why = same_unit(known, frame)

@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow as pa
 
 from anytouch_jax.config import Config
-from anytouch_jax.data.background.rule import UnitGels
+from anytouch_jax.data.background.rule import Backgrounds
 from anytouch_jax.data.loading.samples import evaluation
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder.arrays import Log, unit_rows
@@ -77,9 +77,9 @@ def read_stills(manifest: Manifest, config: Config, rows: np.ndarray) -> np.ndar
 
 
 def drop_without_gel(classes: np.ndarray, manifest: Manifest, sensor: str) -> None:
-    """Take the class from rows of a sensor that have no picture of the untouched gel, in place."""
+    """Take the class from rows of a sensor that have no image of the untouched gel, in place."""
     rows = np.flatnonzero((manifest.text_column("sensor") == sensor) & (classes >= 0))
-    has = rows[UnitGels(manifest).has(rows)]
+    has = rows[Backgrounds(manifest).has(rows)]
     classes[np.setdiff1d(rows, has)] = -1
 
 

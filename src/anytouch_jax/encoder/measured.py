@@ -26,22 +26,22 @@ from anytouch_jax.shown import shown_short
 class Fields:
     """What B frames measure, each value with its standard deviation.
 
-    Maps are (B, h, w) over the whole picture. Without a width (`width_mm` None) lengths are
-    fractions of the picture's width, areas of its square, and force and torque are None. With
+    Maps are (B, h, w) over the whole image. Without a width (`width_mm` None) lengths are
+    fractions of the image's width, areas of its square, and force and torque are None. With
     `faults` the deviations are wide.
 
     Attributes:
         depth: mm into the gel.
-        shear: (B, h, w, 2), mm along x and y of the picture, with one deviation for both: that of
+        shear: (B, h, w, 2), mm along x and y of the image, with one deviation for both: that of
             the dots, or a guess without them.
         contact: probability.
         force: (B, 3), N along x, along y and into the gel.
         torque: (B,), N mm about the centre of pressure.
         slip: (B,), fraction of the contact that slides, NaN without contact.
         area: (B,), mm2.
-        centre: (B, 2), mm of the pressure from the middle of the picture, x to the right and y
+        centre: (B, 2), mm of the pressure from the middle of the image, x to the right and y
             down, NaN without contact.
-        shape: height of the picture over its width.
+        shape: height of the image over its width.
     """
 
     depth: Array
@@ -96,7 +96,7 @@ class Fields:
     def points(self) -> Array:
         """Return the surface of the gel f32 (B, h, w, 3) in mm, in a right-handed frame.
 
-        It is the optical frame of a camera (REP 103): from the middle of the picture, x goes to the
+        It is the optical frame of a camera (REP 103): from the middle of the image, x goes to the
         right, y down, and z away from the camera. The untouched gel lies at z = 0, and a press
         brings its surface nearer to the camera, so z is minus the depth.
         """
@@ -148,10 +148,10 @@ class Measure(Protocol):
 
     @property
     def width_mm(self) -> float | None:
-        """The mm that the picture's width shows, None if nobody knows it."""
+        """The mm that the image's width shows, None if nobody knows it."""
 
-    def oriented(self, picture: Array) -> Array:
-        """Return a picture as the camera takes it, turned and mirrored like those measured."""
+    def oriented(self, image: Array) -> Array:
+        """Return an image as the camera takes it, turned and mirrored like those measured."""
 
     def __call__(self, out: FieldOutput, frames: Sequence[Array]) -> Fields:
         """Return the fields of B frames RGB u8 (h, w, 3), oriented."""

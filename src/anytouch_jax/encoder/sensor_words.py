@@ -18,8 +18,8 @@ class SensorWord(NamedTuple):
 
     Attributes:
         name: that of the table of tokens.
-        width_mm: what the width of a picture shows.
-        shape: height of a picture over its width.
+        width_mm: what the width of an image shows.
+        shape: height of an image over its width.
         modulus_kpa: of the gel.
     """
 

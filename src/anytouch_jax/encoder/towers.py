@@ -140,7 +140,7 @@ class Towers(TouchEncoder):
             embeddings = texts
         else:
             embeddings = self.encode_text(texts)  # type: ignore[arg-type]
-        z_touch = np.asarray(touch, np.float32)
+        z_touch = self._aligned(touch)
         z_text = np.asarray(embeddings, np.float32)
         if z_touch.ndim != 2 or z_text.ndim != 2 or z_touch.shape[1] != z_text.shape[1]:
             width = z_text.shape[-1]
@@ -164,14 +164,25 @@ class Towers(TouchEncoder):
             return net.match(params, losses.normalise(first), losses.normalise(second))
 
         head = self._part("match", run, "matcher")
-        one = np.asarray(first, np.float32)
-        other = np.asarray(second, np.float32)
+        one = self._aligned(first)
+        other = self._aligned(second)
         if one.shape != other.shape or one.ndim != 2:
             raise UserError(
                 f"match takes two sets of features of one shape (B, E), not {one.shape}, "
                 f"{other.shape}"
             )
         return np.asarray(head(arrays.filled(one), arrays.filled(other)))[: len(one)]
+
+    def _aligned(self, touch: npt.ArrayLike) -> npt.NDArray[np.float32]:
+        """Return touch features (B, E) without the values of `nn.sight`, if they have any.
+
+        Towers and matching head were trained with AnyTouch's embedding alone.
+        """
+        values = np.asarray(touch, np.float32)
+        model = self.config.model
+        if values.ndim == 2 and values.shape[1] == model.embed + model.sight:
+            return values[:, : model.embed]
+        return values
 
     def _part(
         self, method: str, run: Callable[..., jax.Array], name: str, *more: str

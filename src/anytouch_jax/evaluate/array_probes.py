@@ -27,8 +27,10 @@ from anytouch_jax.evaluate.scoring import (
 from anytouch_jax.evaluate.splits import LabelledFeatures, Selection, Split
 from anytouch_jax.evaluate.statistics import Array, Protocol
 from anytouch_jax.progress import tracked
+from anytouch_jax.renamed import PROTOCOLS, keywords
 
 
+@keywords({"protocol": PROTOCOLS}, measured="regression")
 def probe_features(  # noqa: PLR0913 - four arrays, and settings that are each used alone
     features: Array,
     labels: npt.ArrayLike,
@@ -36,8 +38,8 @@ def probe_features(  # noqa: PLR0913 - four arrays, and settings that are each u
     split: npt.ArrayLike,
     head: ProbeHead | None = None,
     *,
-    measured: bool = False,
-    protocol: Protocol = "honest",
+    regression: bool = False,
+    protocol: Protocol = "grouped",
     seeds: int = 5,
     subsets: Subsets | None = None,
     name: str = "linear",
@@ -50,8 +52,8 @@ def probe_features(  # noqa: PLR0913 - four arrays, and settings that are each u
         groups: (n,) names of what was sampled independently, such as recordings or objects.
         split: (n,) "train", "val" or "test"; rows of other splits take no part.
         head: linear by default.
-        measured: the labels are continuous, so the head is a regression.
-        protocol: "honest" selects on val or by cross-validation, "published" on test.
+        regression: the labels are continuous, so the head is a regression.
+        protocol: "grouped" selects on val or by cross-validation, "released" on test.
         seeds: how many heads of classes are fitted on bootstraps of the train groups too.
         subsets: parts of test that are scored too, name -> mask over all rows.
         name: of the probe in tables.
@@ -59,13 +61,13 @@ def probe_features(  # noqa: PLR0913 - four arrays, and settings that are each u
     Raises:
         UserError: as `splits.check_rows` does.
     """
-    data, rows, notes = splits.check_rows(features, labels, groups, split, measured=measured)
+    data, rows, notes = splits.check_rows(features, labels, groups, split, regression=regression)
     head = head or ProbeHead()
     found = predict(data, rows, head, protocol, refit=True)
     notes += _fit_notes(found, head)
     scored = Scored(rows, found.predicted, constant_prediction(data, rows), found.selected)
     result = result_of(name, protocol, data, scored, notes, subsets)
-    if not measured:
+    if not regression:
         chosen = replace(head, options=(found.selected.option,))
         result = replace(result, **_refits(data, rows, chosen, found.model, seeds))
     if result.outcome is not None:
@@ -131,12 +133,13 @@ def _codes(names: Array) -> Array:
     return np.unique(names, return_inverse=True)[1]
 
 
+@keywords(measured="regression")
 def leave_groups_out(  # noqa: PLR0913 - three arrays, and settings that are each used alone
     features: Array,
     labels: npt.ArrayLike,
     groups: npt.ArrayLike,
     *,
-    measured: bool = False,
+    regression: bool = False,
     folds: int | None = 10,
     penalties: Sequence[float] | None = None,
     scaling: Scaling = "column",
@@ -153,7 +156,7 @@ def leave_groups_out(  # noqa: PLR0913 - three arrays, and settings that are eac
         features: f32 (n, d), frozen.
         labels: (n,) classes or numbers.
         groups: (n,) names of what is left out together.
-        measured: the labels are continuous, so the head is a regression.
+        regression: the labels are continuous, so the head is a regression.
         folds: into so many the groups are dealt; None leaves each group out alone.
         penalties: of the head; by default from 10 down for classes, from 100 for numbers.
         scaling: of the features; see `ProbeHead`.
@@ -165,18 +168,18 @@ def leave_groups_out(  # noqa: PLR0913 - three arrays, and settings that are eac
     """
     everywhere = np.full(len(np.asarray(labels, object)), "train")
     data, rows, notes = splits.check_rows(
-        features, labels, groups, everywhere, measured=measured, tested=False
+        features, labels, groups, everywhere, regression=regression, tested=False
     )
     used = rows.fit
     if penalties is None:
-        penalties = heads.RIDGE if measured else (10.0, *heads.PENALTIES)
+        penalties = heads.RIDGE if regression else (10.0, *heads.PENALTIES)
     head = ProbeHead("linear", scaling, tuple(penalties))
     count = folds
     if count is None:
         count = len(np.unique(data.groups[used]))
-    parts = splits.group_folds(used, data.groups, None if measured else data.y, count)
+    parts = splits.group_folds(used, data.groups, None if regression else data.y, count)
     cuts = [Split(fit, fit[:0], out) for fit, out in parts]
-    if not measured:
+    if not regression:
         notes += _single_group_note(data, used)
     return probe_cuts(data, cuts, head, name=name, notes=notes, subsets=subsets)
 
@@ -187,7 +190,7 @@ def probe_cuts(
     head: ProbeHead,
     *,
     name: str,
-    protocol: Protocol = "honest",
+    protocol: Protocol = "grouped",
     notes: tuple[str, ...] = (),
     subsets: Subsets | None = None,
 ) -> ProbeResult:

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from anytouch_jax.data.background.rule import UnitGels
+from anytouch_jax.data.background.rule import Backgrounds
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder.arrays import Array, Log
@@ -76,7 +76,7 @@ def probe_counterfactual(
         cache=settings.cache,
         log=log,
         pooling=settings.pooling,
-        join=settings.join,
+        aggregation=settings.aggregation,
     )
     runs: Runs = {}
     settings = replace(settings, controls=False, features=(), cache=None, out=None)
@@ -86,9 +86,9 @@ def probe_counterfactual(
         if name == REAL:
             continue
         real = runs[REAL, task, head, protocol]
-        measured = real[0].sums.shape[1] > 2  # sums of a regression have five columns
+        regression = real[0].sums.shape[1] > 2  # sums of a regression have five columns
         entry = {"task": task, "head": head, "protocol": protocol, "control": name}
-        gains.append(entry | statistics.paired_gain(real, several, measured))
+        gains.append(entry | statistics.paired_gain(real, several, regression))
     return results, gains
 
 
@@ -105,8 +105,10 @@ def touch_sources(
     "background only" is left out where rows have no background. `encoding` are fields of
     `feature_cache.Encoding`.
     """
-    gels = UnitGels(table)
-    real = encoder_features(encoder, table, folder=cache, gels=gels, log=log, **encoding)
+    backgrounds = Backgrounds(table)
+    real = encoder_features(
+        encoder, table, folder=cache, backgrounds=backgrounds, log=log, **encoding
+    )
 
     def from_real(partners: Callable[[Array, int], Array]) -> FeatureStore:
         return FeatureStore(lambda rows, frames: real.get(partners(rows, frames)[:, None], frames))
@@ -118,19 +120,26 @@ def touch_sources(
     def shifted(rows: Array, frames: int) -> Array:
         return shift_in_time(table, rows, frames)
 
-    def prepared(picture: Array) -> Array:
-        own_background = picture if encoder.subtracts else None
-        return np.asarray(encoder.prepare(picture, own_background))
+    def prepared(image: Array) -> Array:
+        own_background = image if encoder.subtracts else None
+        return np.asarray(encoder.prepare(image, own_background))
 
-    gel = gels.shared(prepared)
+    gel = backgrounds.shared(prepared)
 
     def empty(clips: Array, rows: Array) -> Array:
-        pictures = np.stack([np.asarray(gel(row)) for row in rows.tolist()])
-        return np.broadcast_to(pictures[:, None], clips.shape)
+        images = np.stack([np.asarray(gel(row)) for row in rows.tolist()])
+        return np.broadcast_to(images[:, None], clips.shape)
 
     def background(rows: Array, frames: int) -> Array:
         return embed_rows(
-            encoder, table, rows, frames, edit=empty, gels=gels, log=lambda _: None, **encoding
+            encoder,
+            table,
+            rows,
+            frames,
+            edit=empty,
+            backgrounds=backgrounds,
+            log=lambda _: None,
+            **encoding,
         )[1]
 
     stores = {
@@ -139,10 +148,10 @@ def touch_sources(
         SHIFTED: from_real(shifted),
     }
     taking_part = np.flatnonzero(np.isin(table.text_column("split"), ("train", "val", "test")))
-    if gels.has(taking_part).all():
+    if backgrounds.has(taking_part).all():
         stores[BACKGROUND] = FeatureStore(background)
     else:
-        log(f"{BACKGROUND}: left out, as some rows have no picture of the untouched gel")
+        log(f"{BACKGROUND}: left out, as some rows have no image of the untouched gel")
     stores[MEAN] = FeatureStore(average)
     return [FeatureSource(name, store, encoder) for name, store in stores.items()]
 

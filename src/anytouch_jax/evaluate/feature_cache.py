@@ -1,7 +1,7 @@
 """Feature caches: features by manifest row, of an encoder, a features file or raw pixels.
 
 They are kept in memory and, with a folder, on disk. A file is named by everything its features
-depend on, so a change to weights, pictures or settings is another file, and nothing is ever stale.
+depend on, so a change to weights, images or settings is another file, and nothing is ever stale.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ import jax
 import numpy as np
 from sklearn.decomposition import PCA
 
-from anytouch_jax.data.background.rule import ADVICE, UnitGels
+from anytouch_jax.data.background.rule import ADVICE, Backgrounds
 from anytouch_jax.data.loading.samples import read_image
 from anytouch_jax.data.manifest.files import read_file, split_shard_path
 from anytouch_jax.data.manifest.manifest import Manifest, distinct_files
 from anytouch_jax.data.transforms import FORM
-from anytouch_jax.encoder.arrays import Array, Join, Log, Pooling
+from anytouch_jax.encoder.arrays import Aggregation, Array, Log, Pooling
 from anytouch_jax.encoder.embed import Features, embed_rows, read_npz, save_npz
 from anytouch_jax.encoder.encoder import Encoder
 from anytouch_jax.errors import UserError
@@ -38,7 +38,7 @@ Order = Literal["right", "shuffled", "repeated"]
 Compute = Callable[[Array, int], Array]  # (rows i64 (n,), frames) -> features f32 (n, d)
 
 VERSION = 4  # of the features; a change to their computation raises it
-RAW_SIZE = (240, 320)  # of a picture before its area averages
+RAW_SIZE = (240, 320)  # of an image before its area averages
 SMALL = (24, 32)
 COMPONENTS = 200  # principal components of raw pixels
 
@@ -47,7 +47,7 @@ class FeatureStore:
     """Features by row and length of clip, each computed once.
 
     With a `folder` they are stored in an .npz named by content. `describe()` names everything
-    else that they depend on. It is called only if there is a folder, because it reads pictures.
+    else that they depend on. It is called only if there is a folder, because it reads images.
     """
 
     def __init__(
@@ -111,20 +111,20 @@ class Encoding:
 
     Attributes:
         pooling: class token, mean of the patch tokens, or both.
-        join: how the segments of a clip longer than the model's are joined.
+        aggregation: how the segments of a clip longer than the model's are joined.
         order: of the frames of a clip: as recorded, shuffled, or the last one repeated.
         universal: the universal tokens for every sensor, as for unknown ones.
         folder: keeps features on disk.
-        gels: backgrounds of the manifest's sensor instances, found anew without.
+        backgrounds: backgrounds of the manifest's sensor instances, found anew without.
         log: is called with sentences on what is done.
     """
 
     pooling: Pooling = "class"
-    join: Join = "mean"
+    aggregation: Aggregation = "mean"
     order: Order = "right"
     universal: bool = False
     folder: Path | None = None
-    gels: UnitGels | None = None
+    backgrounds: Backgrounds | None = None
     log: Log = lambda _: None
 
 
@@ -133,18 +133,18 @@ def encoder_features(
 ) -> FeatureStore:
     """Return the features of an encoder; `changes` are fields of `Encoding` by name."""
     how = replace(encoding or Encoding(), **changes)
-    gels = how.gels or UnitGels(table)
+    backgrounds = how.backgrounds or Backgrounds(table)
 
     def describe() -> dict[str, Any]:
         content = _content(table, encoder_digest(encoder), how.order)
         content |= {
             "pooling": how.pooling,
-            "join": how.join,
+            "join": how.aggregation,
             "universal": how.universal,
             "background": encoder.config.data.background,
         }
         if encoder.subtracts:
-            content["gels"] = gels.digest()
+            content["gels"] = backgrounds.digest()
         return content
 
     def compute(rows: Array, frames: int) -> Array:
@@ -155,10 +155,10 @@ def encoder_features(
             rows,
             frames,
             how.pooling,
-            how.join,
+            how.aggregation,
             sensor_row=sensor_row,
             edit=partial(reorder_frames, order=how.order),
-            gels=gels,
+            backgrounds=backgrounds,
             log=how.log,
         )[1]
 
@@ -170,14 +170,14 @@ def pixel_features(
     *,
     order: Order = "right",
     folder: Path | None = None,
-    gels: UnitGels | None = None,
+    backgrounds: Backgrounds | None = None,
 ) -> FeatureStore:
     """Return raw pixels of the last frame, and every frame minus the background.
 
     Both are area averages of 24 x 32 x 3 in 0..1. They are the control that needs no network.
     """
-    known = gels or UnitGels(table)
-    # Every picture comes to one size first, so that devices with other resolutions, or with odd
+    known = backgrounds or Backgrounds(table)
+    # Every image comes to one size first, so that devices with other resolutions, or with odd
     # sizes that 24 x 32 does not divide, are averaged over the same areas.
     read = _pair_reader(
         table, known, lambda image: cv2.resize(image, RAW_SIZE[::-1], interpolation=cv2.INTER_AREA)
@@ -295,7 +295,7 @@ def encoder_digest(encoder: Encoder) -> str:
 
 
 def image_digest(table: Manifest, count: int = 32) -> str:
-    """Return SHA-256 over what tells that pictures changed under an equal manifest.
+    """Return SHA-256 over what tells that images changed under an equal manifest.
 
     That is size and mtime of each frame (or its shard), the bytes of all backgrounds, and those of
     `count` sampled frames: reading all would take as long as encoding them. A copy of the folder
@@ -334,14 +334,16 @@ def raw_pixels(frame: Array, background: Array | None) -> Array:
 
 
 def _pair_reader(
-    table: Manifest, gels: UnitGels, prepare: Callable[[Array], Any]
+    table: Manifest, backgrounds: Backgrounds, prepare: Callable[[Array], Any]
 ) -> Callable[[int], tuple[Any, Any]]:
     """Return a function from a row to its prepared frame and untouched gel, None without one."""
-    gel = gels.shared(prepare)
+    gel = backgrounds.shared(prepare)
     return lambda row: (prepare(read_image(table, row)), gel(row))
 
 
-def background_difference(table: Manifest, rows: Array, gels: UnitGels | None = None) -> Array:
+def background_difference(
+    table: Manifest, rows: Array, backgrounds: Backgrounds | None = None
+) -> Array:
     """Return frames minus their untouched gel in RGB: f32 (n, 24 * 32 * 3) in -1..1.
 
     Raises UserError without one.
@@ -350,12 +352,12 @@ def background_difference(table: Manifest, rows: Array, gels: UnitGels | None = 
     def prepare(image: Array) -> tuple[Array, float]:
         return _small(image), image.shape[1] / image.shape[0]
 
-    read = _pair_reader(table, gels or UnitGels(table), prepare)
+    read = _pair_reader(table, backgrounds or Backgrounds(table), prepare)
     values = np.zeros((len(rows), SMALL[0] * SMALL[1] * 3), np.float32)
     for place, row in enumerate(map(int, rows)):
         (frame, proportion), background = read(row)
         if background is None:
-            raise UserError(f"{table.where(row)} has no picture of the untouched gel. {ADVICE}")
+            raise UserError(f"{table.where(row)} has no image of the untouched gel. {ADVICE}")
         if abs(proportion / background[1] - 1) > 1 / FORM:
             raise UserError(
                 f"{table.where(row)}: its background_path has other proportions than the frame."
@@ -383,7 +385,7 @@ def principal_components(
 
 
 def _small(image: Array) -> Array:
-    """Return area averages, f32 (24 * 32 * 3,) in 0..1, of a picture u8 (h, w, 3)."""
+    """Return area averages, f32 (24 * 32 * 3,) in 0..1, of an image u8 (h, w, 3)."""
     return cv2.resize(
         image.astype(np.float32) / 255, SMALL[::-1], interpolation=cv2.INTER_AREA
     ).ravel()

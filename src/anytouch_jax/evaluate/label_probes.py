@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from anytouch_jax.data.background.rule import UnitGels
+from anytouch_jax.data.background.rule import Backgrounds
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder.arrays import Log
 from anytouch_jax.errors import UserError
@@ -16,8 +16,10 @@ from anytouch_jax.evaluate.options import LabelProbeOptions, Models, Paths
 from anytouch_jax.evaluate.results import ProbeResult, probe_json
 from anytouch_jax.evaluate.saved_heads import save_probed
 from anytouch_jax.files import atomic_write
+from anytouch_jax.renamed import PROTOCOLS, keywords
 
 
+@keywords({"protocol": PROTOCOLS}, join="aggregation")
 def probe_label(
     models: Models,
     data: Paths,
@@ -51,16 +53,19 @@ def probe_label(
     task = task_of(table, options)
     rows = select_rows(table, task, options)
     encoders = sources.opened(models)
-    gels = UnitGels(table)
-    plan = plan_rows(table, task, sources.with_gel(rows, gels, encoders), options)
+    backgrounds = Backgrounds(table)
+    plan = plan_rows(table, task, sources.with_gel(rows, backgrounds, encoders), options)
     rows = plan.rows
     log(f"{len(rows.rows)} of {len(table)} rows take part")
-    log(gels.report(rows.rows[:, 0]))
+    log(backgrounds.report(rows.rows[:, 0]))
     for note in plan.notes:
         log(note)
     chance = constant_result(plan)
     encoding = feature_cache.Encoding(
-        pooling=options.pooling, join=options.join, folder=options.cache, gels=gels
+        pooling=options.pooling,
+        aggregation=options.aggregation,
+        folder=options.cache,
+        backgrounds=backgrounds,
     )
     probed = sources.gather_sources(
         table,
@@ -82,7 +87,7 @@ def probe_label(
         results += found
         log(f"probed {source.name}")
         if options.save is not None and source.encoder is not None and not source.is_control:
-            save_probed(source, x, rows, found[0], options, gels, log)
+            save_probed(source, x, rows, found[0], options, backgrounds, log)
     if chance is not None:
         results.append(chance)
     if options.out is not None:

@@ -41,7 +41,7 @@ class LabelPlan(NamedTuple):
     notes: tuple[str, ...]
 
     @property
-    def measured(self) -> bool:
+    def regression(self) -> bool:
         """Whether the label is continuous."""
         return self.task.kind == "regression"
 
@@ -124,9 +124,9 @@ def plan_rows(table: Manifest, task: Task, rows: TaskRows, options: LabelProbeOp
     elif not (np.any(rows.split == "train") and np.any(rows.split == "test")):
         # Recordings of a camera have no split: whole groups are left out, so that no frame of a
         # recording is tested by a head that has seen its neighbours.
-        if options.protocol == "published":
+        if options.protocol == "released":
             raise UserError(
-                "The manifest has no split into train and test, which --protocol published needs."
+                "The manifest has no split into train and test, which --protocol released needs."
             )
         left_out = str(rows.groups[0]).partition(" ")[0]  # keys of groups begin with their column
         notes.append(
@@ -226,11 +226,11 @@ def constant_result(plan: LabelPlan) -> ProbeResult | None:
         rows.labels,
         rows.groups,
         split,
-        measured=plan.measured,
+        regression=plan.regression,
         tested=not plan.left_out,
     )
     if plan.left_out:
         return None
     constant = scoring.constant_prediction(given, cut)
-    name = "mean of train" if plan.measured else "commonest class"
-    return scoring.result_of(name, "honest", given, scoring.Scored(cut, constant, constant))
+    name = "mean of train" if plan.regression else "commonest class"
+    return scoring.result_of(name, "grouped", given, scoring.Scored(cut, constant, constant))

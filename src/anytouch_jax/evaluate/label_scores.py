@@ -26,7 +26,7 @@ def features_of(source: FeatureSource, rows: TaskRows, frames: int) -> Array:
 
 def cost_of(x: Array, plan: LabelPlan, options: LabelProbeOptions) -> str:
     """Return what to say on the time of the fits before they begin, "" if it is short."""
-    if plan.measured:
+    if plan.regression:
         return ""
     names, y = np.unique(plan.rows.labels, return_inverse=True)
     # A selection by cross-validation has a fit for each fold, and so have the fits around it.
@@ -56,7 +56,7 @@ def probe_source(
                 x,
                 rows.labels,
                 rows.groups,
-                measured=plan.measured,
+                regression=plan.regression,
                 scaling=source.scaling,
                 subsets=plan.subsets,
                 name=f"{source.name}: linear, {plan.left_out} left out",
@@ -77,7 +77,7 @@ def probe_source(
                 rows.groups,
                 rows.split,
                 head,
-                measured=plan.measured,
+                regression=plan.regression,
                 protocol=options.protocol,
                 seeds=options.seeds,
                 subsets=plan.subsets,
@@ -94,7 +94,7 @@ def _between_sensors(
     rows = plan.rows
     everywhere = np.full(len(rows.labels), "train")
     data, _, notes = splits.check_rows(
-        x, rows.labels, rows.groups, everywhere, measured=plan.measured, tested=False
+        x, rows.labels, rows.groups, everywhere, regression=plan.regression, tested=False
     )
     notes += (f"fitted on {options.train_sensor}, tested on {options.test_sensor}",)
     return probe_cuts(data, plan.cuts, head, name=name, protocol=options.protocol, notes=notes)

@@ -79,11 +79,11 @@ def logistic_path(
     counts = weights
     if counts is None:
         counts = np.ones(len(x))
-    shares = (counts / np.sum(counts, dtype=np.float64)).astype(np.float32)[:, None]
+    fractions = (counts / np.sum(counts, dtype=np.float64)).astype(np.float32)[:, None]
     with threads(x.size * columns):
-        covariance = (x.T @ (x * shares)).astype(np.float64)
+        covariance = (x.T @ (x * fractions)).astype(np.float64)
         for penalty in penalties:
-            start = _fit(x, y, shares, columns, penalty, covariance, start)
+            start = _fit(x, y, fractions, columns, penalty, covariance, start)
             yield start
 
 
@@ -100,7 +100,7 @@ def path_seconds(x: Array, y: Array, classes: int, strongest: float) -> float:
 def _fit(
     x: Array,
     y: Array,
-    shares: Array,
+    fractions: Array,
     columns: int,
     penalty: float,
     covariance: Array,
@@ -108,35 +108,38 @@ def _fit(
 ) -> Logistic:
     """Return the optimum for one penalty.
 
-    `shares` (n, 1) are the weights of the rows and sum to 1. `covariance` (d, d) is X'X with them.
+    `fractions` (n, 1) are the weights of the rows and sum to 1. `covariance` (d, d) is X'X with
+    them.
     """
     d = x.shape[1]
     # The curvature of the log loss at equal probabilities: p (1 - p) for two classes, else 1 / K.
     # The part -11'/K^2 is left out: it couples the classes, and makes the matrix singular.
-    share = 0.25 if columns == 1 else 1 / columns
+    fraction = 0.25 if columns == 1 else 1 / columns
     # A small diagonal keeps the factor when there are fewer rows than features.
-    diagonal = penalty + 1e-6 * share * np.trace(covariance) / d
-    factor = cholesky(share * covariance + diagonal * np.eye(d), lower=True, check_finite=False)
+    diagonal = penalty + 1e-6 * fraction * np.trace(covariance) / d
+    factor = cholesky(fraction * covariance + diagonal * np.eye(d), lower=True, check_finite=False)
     back = functools.partial(solve_triangular, factor, lower=True, trans="T", check_finite=False)
     forth = functools.partial(solve_triangular, factor, lower=True, check_finite=False)
 
     # The optimiser sees v, the weights times the factor: there the Hessian is about the identity.
     def unpacked(v: Array) -> tuple[Array, Array]:
         v = v.reshape(d + 1, columns)
-        return back(v[:d]), v[d] / np.sqrt(share)
+        return back(v[:d]), v[d] / np.sqrt(fraction)
 
     def value(v: Array) -> tuple[float, Array]:
         weights, bias = unpacked(v)
-        loss, slope = _log_loss(x @ weights.astype(np.float32) + bias.astype(np.float32), y, shares)
+        loss, slope = _log_loss(
+            x @ weights.astype(np.float32) + bias.astype(np.float32), y, fractions
+        )
         loss += penalty / 2 * float(np.sum(weights**2))
         # The gradient by v is that by the weights, times the inverse of the factor (chain rule).
         by_weights = (x.T @ slope).astype(np.float64) + penalty * weights
         by_bias = slope.sum(0, dtype=np.float64)
-        return loss, np.concatenate([forth(by_weights), by_bias[None] / np.sqrt(share)]).ravel()
+        return loss, np.concatenate([forth(by_weights), by_bias[None] / np.sqrt(fraction)]).ravel()
 
     first = np.zeros((d + 1, columns))
     if start is not None and start.weights.shape == (d, columns):
-        first = np.concatenate([factor.T @ start.weights, np.sqrt(share) * start.bias[None]])
+        first = np.concatenate([factor.T @ start.weights, np.sqrt(fraction) * start.bias[None]])
     options = {"maxiter": STEPS, "maxfun": 2 * STEPS, "maxcor": 20, "ftol": 1e-7, "gtol": 1e-6}
     optimum = minimize(value, first.ravel(), jac=True, method="L-BFGS-B", options=options)
     weights, bias = unpacked(optimum.x)
@@ -145,25 +148,25 @@ def _fit(
     )
 
 
-def _log_loss(logits: Array, y: Array, shares: Array) -> tuple[float, Array]:
-    """Return the log loss, weighted by `shares` (n, 1), and its gradient by the logits.
+def _log_loss(logits: Array, y: Array, fractions: Array) -> tuple[float, Array]:
+    """Return the log loss, weighted by `fractions` (n, 1), and its gradient by the logits.
 
     `logits` (n, columns) are overwritten: for 100,000 rows another array of them is what costs.
     """
     if logits.shape[1] == 1:
         signed = np.where(y == 1, logits[:, 0], -logits[:, 0])
-        loss = float(np.sum(shares[:, 0] * np.logaddexp(0, -signed), dtype=np.float64))
+        loss = float(np.sum(fractions[:, 0] * np.logaddexp(0, -signed), dtype=np.float64))
         # float32 overflows above e**88, and beyond 80 the slope is 0 anyway
         slope = np.where(y == 1, -1, 1) / (1 + np.exp(np.minimum(signed, 80)))
-        return loss, (slope[:, None] * shares).astype(np.float32)
+        return loss, (slope[:, None] * fractions).astype(np.float32)
     rows = np.arange(len(y))
     logits -= logits.max(1, keepdims=True)
     right = logits[rows, y]
     np.exp(logits, out=logits)
     total = logits.sum(1, keepdims=True)
-    loss = float(np.sum(shares[:, 0] * (np.log(total[:, 0]) - right), dtype=np.float64))
-    logits *= shares / total
-    logits[rows, y] -= shares[:, 0]
+    loss = float(np.sum(fractions[:, 0] * (np.log(total[:, 0]) - right), dtype=np.float64))
+    logits *= fractions / total
+    logits[rows, y] -= fractions[:, 0]
     return loss, logits
 
 

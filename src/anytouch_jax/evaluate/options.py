@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from anytouch_jax.encoder.arrays import Join, Pooling
+from anytouch_jax.encoder.arrays import Aggregation, Pooling
 from anytouch_jax.encoder.linear_head import COVERAGE, FALSE_ALARMS
 from anytouch_jax.evaluate.feature_cache import FeatureSource, Order
 from anytouch_jax.evaluate.heads import GradientRecipe, HeadName
@@ -26,14 +26,15 @@ class ProbeOptions:
 
     Attributes:
         features: .npz files with features of other encoders, as `anytouch embed` writes them.
-        controls: also probe raw pixels and a random encoder.
+        controls: also probe raw pixels, a random encoder, and an ImageNet network if its package is
+            installed.
         cache: folder that keeps features by content, so that each frame is encoded once.
         out: file for the results as JSON.
         seeds: bootstraps of the train groups (a label), or random splits of the groups (tasks).
-        protocol: "honest" selects the penalty on validation data. "published" selects it on test,
+        protocol: "grouped" selects the penalty on validation data. "released" selects it on test,
             as the authors' released code does.
         pooling: class token, mean of the patch tokens, or both.
-        join: how the segments of a clip longer than the model's are joined.
+        aggregation: how the segments of a clip longer than the model's are joined.
         regression: whether the label is continuous. "auto" goes by its column: numbers with a
             fraction are. Then a score is R2, with the mean absolute error and Spearman's
             correlation beside it.
@@ -44,9 +45,9 @@ class ProbeOptions:
     cache: Path | None = None
     out: Path | None = None
     seeds: int = 5
-    protocol: Protocol = "honest"
+    protocol: Protocol = "grouped"
     pooling: Pooling = "class"
-    join: Join = "mean"
+    aggregation: Aggregation = "mean"
     regression: Regression = "auto"
 
 

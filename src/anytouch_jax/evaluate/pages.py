@@ -8,6 +8,7 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +16,21 @@ from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate.tables import plain
 from anytouch_jax.files import atomic_write
 
-_STYLE = (
-    "body{font:16px/1.5 sans-serif;max-width:60rem;margin:2rem auto;padding:0 "
-    "1rem}img{max-width:100%}"
-    "table{border-collapse:collapse;display:block;overflow-x:auto}td,th{border:1px solid "
-    "#ccc;padding:.2em .6em}"
-)
+# Beside the colours and letters of the page of `anytouch view`.
+_STYLE = """
+body { max-width: 1080px; padding: 24px; font-size: 15px; line-height: 1.55; }
+main { display: grid; gap: 16px; grid-template-columns: minmax(0, 1fr); }
+h1 { font-size: var(--huge); line-height: 1.2; letter-spacing: 0; }
+h2 { font-size: var(--large); }
+.lead { display: grid; gap: 10px; }
+.lead p { max-width: 46em; }
+.lead h1 + p { font-size: 19px; line-height: 1.45; }
+img { max-width: 100%; border-radius: 6px; background: #fff; justify-self: start; }
+table { border-collapse: collapse; display: block; overflow-x: auto; }
+th { text-align: left; font-weight: 600; color: var(--soft); }
+th, td { border-bottom: 1px solid var(--line); padding: 4px 14px 4px 0; white-space: nowrap; }
+ul, ol { margin: 0; padding-left: 20px; color: var(--soft); }
+"""
 # No script, no form and no address: captions of strangers stand on the page.
 _POLICY = (
     "default-src 'none'; img-src data:; style-src 'unsafe-inline'; base-uri 'none'; "
@@ -44,6 +54,7 @@ def write_report(
     sections: Sequence[Section],
     *,
     title: str = "Report",
+    lead: Sequence[str] = (),
     numbers: Mapping[str, Any] | None = None,
 ) -> Path:
     """Write report.html, report.md, report.json and the figures, and return the path of report.md.
@@ -54,13 +65,14 @@ def write_report(
         folder: of the files; figures go into its folder figures/.
         sections: in their order.
         title: of the page.
+        lead: paragraphs before the first section: what the report says, in words.
         numbers: of report.json.
 
     Raises:
         UserError: for a missing figure.
         OSError: for a full disk.
     """
-    parts = [f"# {title}"]
+    parts = [f"# {title}", *lead]
     for section in sections:
         parts += [f"## {section.title}", section.text]
         if section.figure is not None:
@@ -82,7 +94,7 @@ def write_report(
 
 
 def html_page(text: str, folder: Path, title: str) -> str:
-    """Return Markdown as one HTML page with the pictures of `folder`/figures inside.
+    """Return Markdown as one HTML page with the images of `folder`/figures inside.
 
     HTML in the Markdown is shown as text, and no script runs.
     """
@@ -98,11 +110,15 @@ def html_page(text: str, folder: Path, title: str) -> str:
     body = MarkdownIt("commonmark", {"html": False}).enable("table").render(text)
     # A name without slashes: a caption cannot make the page read a file of another folder.
     body = re.sub(r'src="figures/([^"/\\]+)"', inside, body)
+    first, *others = body.split("<h2>")
+    parts = [f'<section class="lead">{first}</section>']
+    parts += [f'<section class="card"><h2>{one}</section>' for one in others]
+    theme = (files("anytouch_jax") / "theme.css").read_text(encoding="utf-8")
     head = (
         f'<meta charset="utf-8"><meta http-equiv="Content-Security-Policy" content="{_POLICY}">'
         f'<meta name="viewport" content="width=device-width"><title>{html.escape(title)}</title>'
     )
     return (
-        f'<!doctype html>\n<html lang="en"><head>{head}<style>{_STYLE}</style></head>\n'
-        f"<body>{body}</body></html>\n"
+        f'<!doctype html>\n<html lang="en"><head>{head}<style>{theme}{_STYLE}</style></head>\n'
+        f"<body><main>{''.join(parts)}</main></body></html>\n"
     )

@@ -1,9 +1,9 @@
-"""Charts as PNG files: losses, t-SNE, sample grids, bars."""
+"""Charts as PNG files: losses and bars."""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -28,12 +28,11 @@ if TYPE_CHECKING:
 
 TERMS = ("reconstruction", "next_frame", "align", "match")  # the terms of a loss that get a curve
 _DPI = 110
-_LEGEND = 12  # more names than that are colours without a legend
 
 
 # The geometry of feature spaces was defined here.
 __all__ = [
-    "ShareBar",
+    "FractionBar",
     "Space",
     "alignment",
     "bars",
@@ -41,17 +40,15 @@ __all__ = [
     "loss_curves",
     "panels",
     "read_metrics",
-    "sample_grid",
     "silhouette",
     "smoothed",
     "tsne",
-    "tsne_panels",
     "uniformity",
     "write_figure",
 ]
 
 
-class ShareBar(NamedTuple):
+class FractionBar(NamedTuple):
     """A fraction (0..1) with its interval and the chance level; None is not drawn."""
 
     value: float
@@ -138,61 +135,9 @@ def smoothed(values: Array) -> Array:
     return np.convolve(values, kernel, "same") / np.convolve(np.ones(len(values)), kernel, "same")
 
 
-def tsne_panels(path: Path, spaces: Mapping[str, Array], sensors: Any, objects: Any) -> None:
-    """Draw points (n, 2) of each named space, coloured by sensor above and by object below."""
-    figure, axes = panels(2, len(spaces), 4.0, 3.8)
-    for labels, what, row in ((sensors, "sensor", axes[0]), (objects, "object", axes[1])):
-        names, codes = np.unique(np.asarray(labels).astype(str), return_inverse=True)
-        colours = _colours(len(names))
-        for axis, (title, points) in zip(row, spaces.items(), strict=True):
-            axis.scatter(points[:, 0], points[:, 1], s=9, c=colours[codes], linewidths=0)
-            axis.set(title=f"{title}, by {what}", xticks=[], yticks=[])
-        if len(names) <= _LEGEND:
-            marks = [row[-1].scatter([], [], s=20, color=colours[i]) for i in range(len(names))]
-            row[-1].legend(
-                marks, names, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False
-            )
-        else:
-            row[-1].set_xlabel(f"{len(names)} {what}s", loc="right")
-    write_figure(path, figure)
-
-
-def sample_grid(
-    path: Path,
-    images: Sequence[Sequence[Array | None]],
-    rows: Sequence[str],
-    columns: Sequence[str],
+def bars(
+    path: Path, series: Mapping[str, Mapping[str, FractionBar]], *, label: str = "fraction"
 ) -> None:
-    """Draw a grid of pictures RGB u8 (h, w, 3), or fields (h, w) as colour maps.
-
-    None is an empty cell. `rows` and `columns` are their titles.
-    """
-    figure, axes = panels(len(rows), len(columns), 1.75, 1.6)
-    for i, (line, title) in enumerate(zip(images, rows, strict=True)):
-        for j, (image, column) in enumerate(zip(line, columns, strict=True)):
-            axis = axes[i][j]
-            # the titles of all columns at one height
-            axis.set(xticks=[], yticks=[], anchor="N")
-            if image is None:
-                axis.set_facecolor("#f2f2f2")
-                centre: dict[str, Any] = {
-                    "ha": "center",
-                    "va": "center",
-                    "transform": axis.transAxes,
-                }
-                axis.text(0.5, 0.5, "none", color="#999999", **centre)
-            else:
-                axis.imshow(image, cmap="viridis", aspect="equal")
-            for side in axis.spines.values():
-                side.set_visible(False)
-            if i == 0:
-                axis.set_title(column, fontsize=9)
-            if j == 0:
-                axis.set_ylabel(title, fontsize=8)
-    write_figure(path, figure)
-
-
-def bars(path: Path, series: Mapping[str, Mapping[str, ShareBar]], *, label: str = "share") -> None:
     """Draw horizontal bars of fractions with their intervals; dashes mark chance.
 
     `series` is {panel: {name: ShareBar}}.
@@ -233,13 +178,3 @@ def panels(
         raise UserError("There is nothing to draw.")
     figure = Figure(figsize=(width * columns, height * rows), layout="constrained")
     return figure, figure.subplots(rows, columns, squeeze=False, **options).tolist()
-
-
-def _colours(count: int) -> Array:
-    """Return RGB colours (count, 3): ten distinct ones, or hues that separate neighbours."""
-    from matplotlib import colormaps
-
-    if count <= 10:
-        return np.asarray(colormaps["tab10"].colors)[:count]  # type: ignore[attr-defined]
-    # steps of the golden ratio around the circle of hues never come close to an earlier one
-    return np.asarray(colormaps["hsv"](np.arange(count) * 0.618 % 1.0))[:, :3] * 0.85

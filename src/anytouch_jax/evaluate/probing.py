@@ -1,8 +1,8 @@
 """Probes of frozen features: of arrays, a label column, named tasks, or a public benchmark.
 
 A task selects rows and labels. Frames are never augmented. The protocols are those of `splits`:
-"honest" holds out whole groups (objects, recordings), which tasks deal again by every seed, and
-"published" keeps the manifest's split and selects on test, as the authors released it.
+"grouped" holds out whole groups (objects, recordings), which tasks deal again by every seed, and
+"released" keeps the manifest's split and selects on test, as the authors released it.
 """
 
 from anytouch_jax.evaluate.array_probes import leave_groups_out, probe_features

@@ -1,4 +1,4 @@
-"""Reconstruction errors of stage 1 on masked pixels, guesses without a model, and pictures."""
+"""Reconstruction errors of stage 1 on masked pixels, guesses without a model, and images."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from anytouch_jax.data.loading.samples import evaluation
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.data.transforms import UNTOUCHED
 from anytouch_jax.errors import refuse_forked
+from anytouch_jax.evaluate.statistics import mean_interval
 from anytouch_jax.objectives import normalise_touch, reconstruct
 from anytouch_jax.ops import losses, tokens
 
@@ -52,8 +53,16 @@ def pixel_scores(
     """
     if config.objective.norm_pix_loss or not len(ends):
         raise ValueError("pixels are scored on at least one clip, and not with norm_pix_loss")
+    each = clip_scores(params, manifest, ends, net=net, config=config)
+    return {name: float(values.mean()) for name, values in each.items()}
+
+
+def clip_scores(
+    params: Any, manifest: Manifest, ends: np.ndarray, *, net: Net, config: Config
+) -> dict[str, np.ndarray]:
+    """Return the errors of `pixel_scores` of each clip (n,), in the order of `ends`."""
     refuse_forked()
-    sums = dict[str, float]()
+    parts = dict[str, list[np.ndarray]]()
     count = 0
     frames = config.model.frames + config.objective.next_frame
     for ids, batch in evaluation(
@@ -66,9 +75,10 @@ def pixel_scores(
         errors = _errors(
             params, batch.clip[:n], batch.sensor[:n], noise[:n], net=net, config=config
         )
-        sums = {name: sums.get(name, 0.0) + float(value) * n for name, value in errors.items()}
+        for name, values in errors.items():
+            parts.setdefault(name, []).append(np.asarray(values))
         count += n
-    return {name: value / count for name, value in sums.items()}
+    return {name: np.concatenate(several) for name, several in parts.items()}
 
 
 def contact_errors(
@@ -76,8 +86,9 @@ def contact_errors(
 ) -> dict[str, Any]:
     """Return errors of stage 1 and of guesses on clips in contact, {} if there are none.
 
-    Frames without contact are the background in every patch, so they would flatter everything.
-    `ends` are the last rows of clips, of which at most 240 are scored.
+    "gains" has for each term the best guess, by how much stage 1 is better, and the 95 % interval
+    of that over objects. Frames without contact are the background in every patch, so they would
+    flatter everything. `ends` are the last rows of clips, of which at most 240 are scored.
     """
     # in contact or unknown
     ends = ends[known_contact(manifest)[ends] != 0]
@@ -86,15 +97,26 @@ def contact_errors(
         return {}
     ends = ends[np.linspace(0, len(ends) - 1, min(_CLIPS, len(ends))).astype(int)]
     config = replace(config, data=replace(config.data, batch_size=min(48, len(ends))))
-    return {"clips": len(ends)} | pixel_scores(
-        params, manifest, ends, net=encoder.net, config=config
-    )
+    each = clip_scores(params, manifest, ends, net=encoder.net, config=config)
+    groups = manifest.text_column("object")[ends]
+    groups = np.where(groups == "", manifest.text_column("sequence")[ends], groups)
+    scores: dict[str, Any] = {"clips": len(ends), "gains": {}}
+    scores |= {name: float(values.mean()) for name, values in each.items()}
+    for term in ("reconstruction", "next_frame"):
+        guesses = [kind for kind in ("untouched ", "plain ") if kind + term in each]
+        if term not in each or not guesses:
+            continue
+        best = min(guesses, key=lambda kind: scores[kind + term])
+        gain = each[best + term] - each[term]
+        scores["gains"][term] = (best, float(gain.mean()), *mean_interval(gain, groups))
+    return scores
 
 
 @partial(jax.jit, static_argnames=("net", "config"))
 def _errors(
     params: Any, clip: Any, sensor: Any, noise: Any, *, net: Net, config: Config
 ) -> dict[str, Any]:
+    """Return the errors (n,) of each clip, of the network and of guesses."""
     clip = normalise_touch(clip)
     pixels, hidden = reconstruct(params, clip, sensor, noise, net=net, config=config)
     target = tokens.patchify(clip, net.model.patch)
@@ -104,11 +126,17 @@ def _errors(
         predictions["untouched "] = tokens.patchify(gel, net.model.patch)
     has_next = clip.shape[1] > net.model.frames
     errors = {}
+    terms_of = partial(_terms, next_frame=has_next)
     for kind, prediction in predictions.items():
-        _, terms = losses.reconstruction_loss(prediction, target, hidden, next_frame=has_next)
-        for term, value in terms.items():
-            errors[kind + term] = value
+        for term, values in jax.vmap(terms_of)(prediction, target, hidden).items():
+            errors[kind + term] = values
     return errors
+
+
+def _terms(prediction: Any, target: Any, hidden: Any, *, next_frame: bool) -> dict[str, Any]:
+    """Return the terms of the loss of one clip: all clips have equally many hidden patches."""
+    rows = (one[None] for one in (prediction, target, hidden))
+    return losses.reconstruction_loss(*rows, next_frame=next_frame)[1]
 
 
 def plain_reconstruction(target: Any, hidden: Any, frames: int) -> Any:
@@ -167,8 +195,8 @@ def reconstruction_panels(
     gap = ((0, 0), (0, 0), (0, _GAP), (0, _GAP), (0, 0))
     columns = []
     for name, block in blocks.items():
-        pictures = np.pad(block, gap, constant_values=255)  # (B, T, h, w, 3)
-        column = pictures.transpose(0, 2, 1, 3, 4).reshape(len(block) * (size + _GAP), -1, 3)
+        images = np.pad(block, gap, constant_values=255)  # (B, T, h, w, 3)
+        column = images.transpose(0, 2, 1, 3, 4).reshape(len(block) * (size + _GAP), -1, 3)
         title = np.full((_TITLE, column.shape[1], 3), 255, np.uint8)
         cv2.putText(
             title, name, (2, _TITLE - 4), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 0, 0), 1, cv2.LINE_AA

@@ -1,4 +1,4 @@
-"""The report of a stage-1 and a stage-2 run on a manifest: what the demo learned."""
+"""The report of a stage-1 and a stage-2 run on a manifest: what they have learned."""
 
 from __future__ import annotations
 
@@ -12,18 +12,20 @@ import jax
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder.arrays import Log
 from anytouch_jax.errors import UserError
-from anytouch_jax.evaluate import report_features, report_retrieval, report_samples
+from anytouch_jax.evaluate import report_features, report_retrieval
 from anytouch_jax.evaluate.pages import Section, write_report
 from anytouch_jax.evaluate.report_features import LABELS
-from anytouch_jax.evaluate.report_reconstructions import reconstructions_section
+from anytouch_jax.evaluate.report_reconstructions import pixel_claims, reconstructions_section
 from anytouch_jax.evaluate.report_rows import chosen_touches
-from anytouch_jax.evaluate.report_stages import encoders_of, lineage
+from anytouch_jax.evaluate.report_runs import runs_section
+from anytouch_jax.evaluate.report_stages import encoders_of
 from anytouch_jax.evaluate.report_study import PIXELS, VECTOR, study_of
+from anytouch_jax.evaluate.report_words import opening
 
 # Section, write_report and the names of baselines were defined here.
 __all__ = ["LABELS", "PIXELS", "VECTOR", "Section", "demo_report", "write_report"]
 
-FEWEST = 4  # rows of a t-SNE
+FEWEST = 4  # rows of test, for an interval of anything
 
 
 def demo_report(
@@ -72,26 +74,36 @@ def demo_report(
     double = first.config.model.dtype == "float64"
     with tempfile.TemporaryDirectory(prefix="anytouch-report-") as folder, jax.enable_x64(double):
         drawn = Path(folder)
-        started_from = lineage(runs["stage 1"], second)
-        sections = [report_samples.facts_section(table, first, second, started_from)]
-        sections += report_samples.samples_section(table, drawn, seed=seed)
-        sections.append(report_samples.losses_section(runs, drawn))
-        parts: dict[str, tuple[Section, Any]] = {
+        parts: dict[str, tuple[Section | None, Any]] = {
             "pixels": reconstructions_section(table, first, drawn)
         }
-        log("report: samples, losses and reconstructions are drawn")
+        log("report: reconstructions are drawn")
         study = study_of(table, encoders, touches, seed, log)
         log(f"report: {len(study.rows)} frames embedded by {len(encoders)} encoders")
-        parts |= {
-            "space": report_features.space_section(study, drawn, seed),
-            "retrieval": report_retrieval.study_retrieval(study, drawn, gallery_size),
-        }
-        log("report: t-SNE is drawn, retrieval is scored")
+        parts["retrieval"] = report_retrieval.study_retrieval(study, drawn, gallery_size)
         parts["matching"] = report_retrieval.matching_section(study, second)
+        log("report: retrieval is scored")
         parts["probes"] = report_features.probes_section(study, drawn)
-        sections += [section for section, _ in parts.values()]
         numbers |= {name: scored for name, (_, scored) in parts.items()}
+        found = numbers["retrieval"]
+        claims = [
+            *report_retrieval.retrieval_claims(found["differences"], found["found"]),
+            *report_features.probe_claims(numbers["probes"]["found"]),
+            *pixel_claims(numbers["pixels"]),
+        ]
+        # Of what could not be scored there is no section, but nobody should miss it.
+        for name in ("retrieval", "matching", "probes"):
+            for note in numbers[name]["notes"]:
+                log(f"report: {name}: {note}")
+        sections = [section for section, _ in parts.values() if section is not None]
+        sections.append(runs_section(table, runs, encoders, drawn))
         numbers["seconds"] = round(time.perf_counter() - clock, 1)
-        path = write_report(Path(out), sections, title="What the demo learned", numbers=numbers)
+        path = write_report(
+            Path(out),
+            sections,
+            title="What two runs have learned",
+            lead=opening(claims, runs),
+            numbers=numbers,
+        )
     log(f"{path}: written in {numbers['seconds']:.0f} s")
     return path

@@ -12,21 +12,23 @@ from anytouch_jax.encoder.encoder import Encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import plots, retrieval
 from anytouch_jax.evaluate.pages import Section
-from anytouch_jax.evaluate.plots import ShareBar
+from anytouch_jax.evaluate.plots import FractionBar
 from anytouch_jax.evaluate.report_rows import grades_of
 from anytouch_jax.evaluate.report_study import PIXELS, VECTOR, Study, baseline
+from anytouch_jax.evaluate.report_words import Claim
 from anytouch_jax.evaluate.retrieval import GALLERY
-from anytouch_jax.evaluate.tables import listed_notes, markdown_table, score_text
+from anytouch_jax.evaluate.tables import markdown_table, score_text
 
 __all__ = ["GALLERY", "matching_section", "retrieval_section", "study_retrieval"]
 
 Change = tuple[float, float | None, float | None]  # a difference with its interval
 
 
-def study_retrieval(study: Study, out: Path, size: int) -> tuple[Section, dict[str, Any]]:
+def study_retrieval(study: Study, out: Path, size: int) -> tuple[Section | None, dict[str, Any]]:
     """Return retrieval of the test rows for each grade of alignment.
 
-    Each is scored with matched galleries and with random ones.
+    Each is scored with matched galleries and with random ones. The section is None where nothing
+    could be scored.
     """
     table = study.manifest
     rows = study.test(study.rows)
@@ -65,22 +67,20 @@ def study_retrieval(study: Study, out: Path, size: int) -> tuple[Section, dict[s
                 )
             except UserError as error:
                 notes.append(f"{grade}, gallery {kind}: not scored: {error}")
-    section, changes = retrieval_section(results, "stage 2", notes, out)
+    section, changes = retrieval_section(results, "stage 2", out)
     return section, {"found": results, "differences": changes, "notes": notes}
 
 
 def retrieval_section(
     results: Mapping[str, Mapping[str, Sequence[retrieval.Retrieval]]],
     best: str,
-    notes: Sequence[str],
     folder: Path,
-) -> tuple[Section, dict[str, dict[str, Change]]]:
+) -> tuple[Section | None, dict[str, dict[str, Change]]]:
     """Return tables of retrieval, and paired differences to `best`.
 
     Args:
         results: {grade: {"matched" or "by chance": results}}.
         best: the features that are compared with the others.
-        notes: what a reader should know.
         folder: of the report; the figure goes into its folder figures/.
     """
     rows = []
@@ -101,7 +101,7 @@ def retrieval_section(
             if other == kind and not centred
         }
         panels[f"{grade}, gallery {kind}"] = {
-            name: ShareBar(result.top1, result.low, result.high, result.chance1)
+            name: FractionBar(result.top1, result.low, result.high, result.chance1)
             for name, result in plain.items()
         }
         others = [name for name in plain if name != best] if best in plain else []
@@ -144,13 +144,38 @@ def retrieval_section(
     )
     if near:
         text += f" Distractors lie at {np.mean(near):.2f} of the mean distance of all touches."
-    figure = path if panels else None
-    section = Section("Cross-sensor retrieval", text, table, figure, listed_notes(notes))
+    section = None
+    if panels:
+        text += " Dashes mark chance."
+        section = Section("The same touch by another sensor", text, table, path)
     return section, changes
 
 
-def matching_section(study: Study, encoder: Encoder) -> tuple[Section, dict[str, Any]]:
-    """Return the scores of the matching head of stage 2 on the test rows.
+def retrieval_claims(changes: Mapping[str, Mapping[str, Change]], found: Any) -> list[Claim]:
+    """Return what retrieval says of stage 2, beside the best features without training."""
+    claims = []
+    for grade, others in changes.items():
+        kinds = found[grade]
+        several = kinds.get("matched") or kinds["by chance"]
+        of = {
+            one.name: one
+            for one in several
+            if one.query_sensor == retrieval.ALL and not one.centred
+        }
+        names = [name for name in others if not name.startswith(("stage 1", "stage 2"))]
+        if "stage 2" not in of or not names:
+            continue
+        best = max(names, key=lambda name: of[name].top1)
+        own = of["stage 2"]
+        told = score_text(own.top1, own.low, own.high)
+        guess = f"{best} finds {score_text(of[best].top1)} and chance {score_text(own.chance1)}"
+        what = f"the same touch by another sensor ({grade}) is first in"
+        claims.append(Claim(what, told, guess, *others[best][1:]))
+    return claims
+
+
+def matching_section(study: Study, encoder: Encoder) -> tuple[Section | None, dict[str, Any]]:
+    """Return the scores of the matching head of stage 2 on the test rows, None without a head.
 
     There is one for each kind of negatives.
     """
@@ -180,8 +205,7 @@ def matching_section(study: Study, encoder: Encoder) -> tuple[Section, dict[str,
         )
         for score in scores
     ]
-    table = ""
+    section = None
     if rows:
-        table = markdown_table(head, rows)
-    section = Section("Cross-sensor matching", text, table, notes=listed_notes(notes))
+        section = Section("Cross-sensor matching", text, markdown_table(head, rows))
     return section, {"found": scores, "notes": notes}

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from anytouch_jax.data.background.rule import UnitGels
+from anytouch_jax.data.background.rule import Backgrounds
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder.arrays import Array, Log
 from anytouch_jax.encoder.embed import embed_rows, rows_with_gel
@@ -50,13 +50,17 @@ def study_of(
     )
     classes = {}
     patches = {}
-    gels = UnitGels(table)
+    backgrounds = Backgrounds(table)
     for encoder in encoders.values():
-        rows = rows_with_gel(encoder, gels, rows, log)
+        rows = rows_with_gel(encoder, backgrounds, rows, log)
     for name, encoder in encoders.items():
-        values = embed_rows(encoder, table, rows, pooling="both", gels=gels, log=log)[1]
-        classes[name], patches[name] = np.split(values, [encoder.config.model.embed], axis=1)
-    pixels, notes = baseline(PIXELS, lambda: background_difference(table, rows, gels))
+        values = embed_rows(encoder, table, rows, pooling="both", backgrounds=backgrounds, log=log)[
+            1
+        ]
+        width = encoder.config.model.embed
+        # What a trunk adds, `nn.sight`, follows both.
+        classes[name], patches[name], _ = np.split(values, [width, 2 * width], axis=1)
+    pixels, notes = baseline(PIXELS, lambda: background_difference(table, rows, backgrounds))
     return Study(
         table, rows, table.text_column("split")[rows], classes, patches, pixels, tuple(notes)
     )

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from anytouch_jax.evaluate.statistics import Array, GroupSums, Protocol
-from anytouch_jax.evaluate.tables import interval_text, markdown_table, plain, share_text
+from anytouch_jax.evaluate.tables import fraction_text, interval_text, markdown_table, plain
 from anytouch_jax.shown import shown_short
 
 if TYPE_CHECKING:
@@ -137,7 +137,7 @@ class ProbeResult:
     outcome: Outcome | None = field(default=None, repr=False, compare=False)
 
     @property
-    def measured(self) -> bool:
+    def regression(self) -> bool:
         """Whether the label is continuous, so that the head is a regression."""
         return not np.isnan(self.r2)
 
@@ -149,7 +149,7 @@ def probe_json(results: Sequence[ProbeResult]) -> str:
     """
     records = []
     for result in results:
-        others = _OF_CLASSES if result.measured else _OF_NUMBERS
+        others = _OF_CLASSES if result.regression else _OF_NUMBERS
         record = plain(result)
         records.append({name: value for name, value in record.items() if name not in others})
     return json.dumps(records, indent=2, allow_nan=False)
@@ -199,8 +199,8 @@ def _result_cells(result: ProbeResult) -> dict[str, str]:
     line = {"probe": result.probe, "protocol": result.protocol}
     line |= _score_cells(
         {
-            "metric": "r2" if result.measured else "accuracy",
-            "mean": result.r2 if result.measured else result.accuracy,
+            "metric": "r2" if result.regression else "accuracy",
+            "mean": result.r2 if result.regression else result.accuracy,
             "low": result.low,
             "high": result.high,
             "chance": result.baseline,
@@ -215,14 +215,14 @@ def _result_cells(result: ProbeResult) -> dict[str, str]:
             "groups": result.test_groups,
         }
     )
-    if result.measured:
+    if result.regression:
         line["MAE 95 %"] = interval_text(result.mae_low, result.mae_high, 1.0, 3)
     else:
-        line["balanced"] = share_text(result.balanced_accuracy)
+        line["balanced"] = fraction_text(result.balanced_accuracy)
         line["refits"] = "-"
         if result.seeds:
             deviation = 100 * (result.refit_std or 0)
-            line["refits"] = f"{share_text(result.refit_mean)} ± {deviation:.1f}"
+            line["refits"] = f"{fraction_text(result.refit_mean)} ± {deviation:.1f}"
         line["classes"] = str(len(result.classes))
     line["penalty or k"] = "-"
     if result.penalty is not None:
@@ -238,7 +238,7 @@ def _part_cells(result: ProbeResult) -> list[dict[str, str]]:
             {
                 "probe": f"{result.probe}: {part.name}",
                 "protocol": result.protocol,
-                "score": share_text(part.accuracy),
+                "score": fraction_text(part.accuracy),
                 "95 %": interval_text(part.low, part.high),
                 "test (groups)": str(part.n_test),
             }
@@ -256,9 +256,9 @@ def _score_cells(row: Mapping[str, Any]) -> dict[str, str]:
         chance = f"{row['chance_mae']:.3g} {row['unit']}".strip()
         more["Spearman"] = _rank_text(row)
     else:
-        score = share_text(row["mean"])
+        score = fraction_text(row["mean"])
         interval = interval_text(row["low"], row["high"])
-        chance = share_text(row["chance"])
+        chance = fraction_text(row["chance"])
     return {
         "score": score,
         "95 %": interval,

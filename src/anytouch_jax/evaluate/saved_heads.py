@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from anytouch_jax.data.background.rule import UnitGels
+from anytouch_jax.data.background.rule import Backgrounds
 from anytouch_jax.encoder.arrays import Array, Log
 from anytouch_jax.encoder.linear_head import LinearHead, save_head
 from anytouch_jax.errors import UserError
@@ -23,7 +23,7 @@ def save_probed(
     rows: TaskRows,
     result: ProbeResult,
     options: LabelProbeOptions,
-    gels: UnitGels,
+    backgrounds: Backgrounds,
     log: Log,
 ) -> None:
     """Write the linear head that a result was scored with, calibrated on rows it has not seen.
@@ -52,7 +52,7 @@ def save_probed(
         fingerprint=encoder.fingerprint,
     )
     if encoder.subtracts:
-        head = replace(head, gels=gels.pictures(rows.rows[:, 0]))
+        head = replace(head, backgrounds=backgrounds.images(rows.rows[:, 0]))
     limits = {"coverage": options.coverage, "false_alarms": options.false_alarms}
     save_head(path, calibrated(head, x, rows, penalty, log, **limits))
     log(f"{path}: the linear head")
@@ -64,7 +64,7 @@ def fit_all(x: Array, rows: TaskRows) -> tuple[heads.LinearModel, Array, float]:
     The penalty is chosen by cross-validation over groups.
     """
     data, cut, _ = splits.check_rows(x, rows.labels, rows.groups, rows.split, tested=False)
-    penalty = splits.select_option(heads.ProbeHead(), data, cut, "honest").option
+    penalty = splits.select_option(heads.ProbeHead(), data, cut, "grouped").option
     (model,) = data.fit(heads.ProbeHead(options=(penalty,)), cut.fit).models
     return model, data.names, penalty
 

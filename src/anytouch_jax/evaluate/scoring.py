@@ -104,10 +104,10 @@ def result_of(
     tested = scored.rows.test
     truth = data.y[tested]
     groups = data.groups[tested]
-    measured = not len(data.names)
+    regression = not len(data.names)
     sums = score_sums(data, scored.predicted, tested)
     constant = score_sums(data, scored.constant, tested)
-    scores = statistics.scores([sums], [constant], measured)
+    scores = statistics.scores([sums], [constant], regression)
     option = None
     chosen_on = ""
     if scored.selected is not None:
@@ -115,7 +115,7 @@ def result_of(
         chosen_on = scored.selected.chosen_on
     more: dict[str, Any] = {}
     correct = np.zeros(0, bool)
-    if measured:
+    if regression:
         names = ("mae", "mae_low", "mae_high", "spearman", "spearman_low", "spearman_high")
         more = {key: scores[key] for key in names}
         more |= {"r2": scores["mean"], "baseline_mae": scores["chance_mae"]}

@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from anytouch_jax.config import preset
-from anytouch_jax.data.background.rule import ADVICE, UnitGels
+from anytouch_jax.data.background.rule import ADVICE, Backgrounds
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder.arrays import Array
 from anytouch_jax.encoder.encoder import Encoder, check_frames, load_encoder, random_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import feature_cache
 from anytouch_jax.evaluate.feature_cache import Encoding, FeatureSource
-from anytouch_jax.evaluate.statistics import RANDOM, RAW
+from anytouch_jax.evaluate.statistics import IMAGENET, RANDOM, RAW
 from anytouch_jax.evaluate.tasks import TaskRows
+from anytouch_jax.weights import registry
 
+_IMAGENET_NAME = "efficientnet_lite0"
 Opened = Sequence[Encoder | FeatureSource]
 
 
@@ -32,7 +35,7 @@ def _encoder_of(model: Encoder | FeatureSource) -> Encoder | None:
     return model
 
 
-def with_gel(rows: TaskRows, gels: UnitGels, models: Opened) -> TaskRows:
+def with_gel(rows: TaskRows, backgrounds: Backgrounds, models: Opened) -> TaskRows:
     """Return the rows that all models can read, for those that need a background.
 
     All sources are probed on the same rows, or their scores could not be compared in pairs. Raises
@@ -41,15 +44,14 @@ def with_gel(rows: TaskRows, gels: UnitGels, models: Opened) -> TaskRows:
     encoders = [_encoder_of(model) for model in models]
     if not any(encoder is not None and encoder.needs_background for encoder in encoders):
         return rows
-    has = np.all(gels.has(rows.rows.ravel()).reshape(rows.rows.shape), axis=1)
+    has = np.all(backgrounds.has(rows.rows.ravel()).reshape(rows.rows.shape), axis=1)
     if not has.any():
         raise UserError(
-            f"None of {len(rows.rows)} rows has a picture of the untouched gel to subtract. "
-            f"{ADVICE}"
+            f"None of {len(rows.rows)} rows has an image of the untouched gel to subtract. {ADVICE}"
         )
     notes = rows.notes
     if not has.all():
-        notes += (f"{(~has).sum()} rows are left out: they have no picture of the untouched gel",)
+        notes += (f"{(~has).sum()} rows are left out: they have no image of the untouched gel",)
     return rows.take(np.flatnonzero(has))._replace(notes=notes)
 
 
@@ -66,16 +68,29 @@ def _random_source(table: Manifest, models: Opened, encoding: Encoding) -> Featu
 def _pixel_source(table: Manifest, models: Opened, encoding: Encoding) -> FeatureSource:
     """Return raw pixels, which share one scale: unit spread for each would amplify noise."""
     store = feature_cache.pixel_features(
-        table, order=encoding.order, folder=encoding.folder, gels=encoding.gels
+        table, order=encoding.order, folder=encoding.folder, backgrounds=encoding.backgrounds
     )
     return FeatureSource(RAW, store, None, "common", is_control=True)
 
 
+def _imagenet_source(table: Manifest, models: Opened, encoding: Encoding) -> FeatureSource | None:
+    """Return an ImageNet network off the shelf, None where its package is not installed."""
+    if not registry.is_installed(_IMAGENET_NAME):
+        return None
+    encoder = load_encoder(_IMAGENET_NAME)
+    # It has one kind of feature, so all poolings share what is stored.
+    encoding = replace(encoding, pooling="class")
+    store = feature_cache.encoder_features(encoder, table, encoding)
+    return FeatureSource(IMAGENET, store, encoder, is_control=True)
+
+
 # What a user would compare with, by name. A row adds a control to every probe: a function from
-# the manifest, the opened models and the encoding to a source with `is_control`.
-CONTROLS: dict[str, Callable[[Manifest, Opened, Encoding], FeatureSource]] = {
+# the manifest, the opened models and the encoding to a source with `is_control`, or to None where
+# it cannot be had.
+CONTROLS: dict[str, Callable[[Manifest, Opened, Encoding], FeatureSource | None]] = {
     RANDOM: _random_source,
     RAW: _pixel_source,
+    IMAGENET: _imagenet_source,
 }
 
 
@@ -110,9 +125,10 @@ def gather_sources(
         check_frames(encoder.config.model, least)
         store = feature_cache.encoder_features(encoder, table, encoding)
         several.append(FeatureSource(name, store, encoder))
-    others = []
+    others = list[FeatureSource]()
     if controls:
-        others = [make(table, models, encoding) for make in CONTROLS.values()]
+        made = [make(table, models, encoding) for make in CONTROLS.values()]
+        others = [one for one in made if one is not None]
     for control in others:
         if control.encoder is not None:
             check_frames(control.encoder.config.model, least)

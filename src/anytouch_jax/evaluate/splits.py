@@ -1,8 +1,8 @@
 """Train/validation/test splits that keep whole groups together, and the selection of an option.
 
-Every result names its protocol. By "honest" (a grouped hold-out) the penalty (k, epoch) is selected
-on val, or by cross-validation over groups of train, and test is read once. By "published" it is
-selected on test, as the authors released it.
+Every result names its protocol. By "grouped" (a grouped hold-out) the penalty (k, epoch) is
+selected on val, or by cross-validation over groups of train, and test is read once. By "released"
+it is selected on test, as the authors released it.
 
 Groups are held out whole because frames of one recording, and recordings of one object, are alike:
 a head that has seen one frame names the others by their gel, light and texture, whatever it knows
@@ -46,7 +46,7 @@ class RowRoles(NamedTuple):
     """Labels `y`, `groups` and masks of the rows of a task, all (n,).
 
     `test` goes by the split of the manifest, `may_fit` and `may_test` by sensor and sensor
-    instance. With `measured` labels are continuous, else class numbers.
+    instance. With `regression` labels are continuous, else class numbers.
     """
 
     y: Array
@@ -54,7 +54,7 @@ class RowRoles(NamedTuple):
     test: Array
     may_fit: Array
     may_test: Array
-    measured: bool = False
+    regression: bool = False
 
     @property
     def fitted(self) -> Array:
@@ -70,25 +70,25 @@ def assign_roles(task: Task, rows: TaskRows, sides: Sides) -> tuple[RowRoles, Ar
 
     Raises UserError if nothing is left to fit on or to test.
     """
-    measured = task.kind == "regression"
+    regression = task.kind == "regression"
     may_fit = _on_side("train", rows, sides)
     may_test = _on_side("test", rows, sides)
     names = np.array([], str)
     y = rows.labels
-    if not measured:
+    if not regression:
         names, y = np.unique(rows.labels, return_inverse=True)
-    roles = RowRoles(y, rows.groups, rows.split == "test", may_fit, may_test, measured)
+    roles = RowRoles(y, rows.groups, rows.split == "test", may_fit, may_test, regression)
     for mask, purpose in ((roles.tested, "test"), (roles.may_fit, "train")):
         if not mask.any():
             raise UserError(
                 f"Task {task.name}: no row is left to {purpose}. Check the splits, sensors and "
                 "units."
             )
-    if measured and np.ptp(y[roles.tested]) == 0:
+    if regression and np.ptp(y[roles.tested]) == 0:
         raise UserError(
             f"Task {task.name}: {task.label} is constant on test. R2 has no meaning there."
         )
-    if not measured and len(names) < 2:
+    if not regression and len(names) < 2:
         raise UserError(
             f"Task {task.name}: the label is {str(names[0])!r} on every row. A probe needs two "
             "classes."
@@ -189,7 +189,7 @@ def split_scheme(roles: RowRoles) -> tuple[Literal["split", "folds"], Array, str
     """
     fitted = roles.y[roles.fitted]
     tested = roles.y[roles.tested]
-    if roles.measured:
+    if roles.regression:
         missing = "row to fit on"
         can_fit = len(fitted) > 0
     else:
@@ -217,7 +217,7 @@ def seeded_splits(roles: RowRoles, seed: int, protocol: Protocol) -> list[Split]
     It is one by the manifest's split, or FOLDS that test every row once.
 
     In a grouped hold-out a fifth of the groups of train selects, in each fold anew: the choice is
-    nested, so no row has a part in the choice by which it is scored. By "published" the manifest's
+    nested, so no row has a part in the choice by which it is scored. By "released" the manifest's
     split is used even if it shares groups, and test selects. Raises UserError for too few groups.
     """
     _check_protocol(protocol)
@@ -226,19 +226,19 @@ def seeded_splits(roles: RowRoles, seed: int, protocol: Protocol) -> list[Split]
 
     def folds(rows: Array) -> Array:
         y = None
-        if not roles.measured:
+        if not roles.regression:
             y = roles.y[rows]
         return assign_folds(roles.groups[rows], y, rng)
 
     def split(train: Array, test: Array) -> Split:
-        if protocol == "published":
+        if protocol == "released":
             return Split(train, train[:0], test)
         fold = folds(train)
         return Split(train[fold != 0], train[fold == 0], test)
 
     scheme, used, _ = split_scheme(roles)
     has_train = np.any(used & ~roles.test)
-    if scheme == "split" or (protocol == "published" and has_train):
+    if scheme == "split" or (protocol == "released" and has_train):
         return [split(np.flatnonzero(roles.fitted), np.flatnonzero(roles.tested))]
     rows = np.flatnonzero(used & (roles.may_fit | roles.may_test))
     fold = folds(rows)
@@ -252,8 +252,8 @@ def seeded_splits(roles: RowRoles, seed: int, protocol: Protocol) -> list[Split]
 
 
 def _check_protocol(protocol: str) -> None:
-    if protocol not in ("honest", "published"):
-        raise UserError(f"Unknown protocol {protocol!r}. Choose honest or published.")
+    if protocol not in ("grouped", "released"):
+        raise UserError(f"Unknown protocol {protocol!r}. Choose grouped or released.")
 
 
 class LabelledFeatures(NamedTuple):
@@ -300,7 +300,7 @@ def select_option(
     if head.name != "gradient":
         fit = subsample(split.fit)
     classes = len(data.names)
-    if protocol == "published":
+    if protocol == "released":
         chosen_on = "test"
         parts = [(fit, split.test)]
     elif len(split.val):
@@ -330,7 +330,7 @@ def check_rows(
     groups: npt.ArrayLike,
     split: npt.ArrayLike,
     *,
-    measured: bool = False,
+    regression: bool = False,
     tested: bool = True,
 ) -> tuple[LabelledFeatures, Split, tuple[str, ...]]:
     """Return the arguments of a probe as records, with notes on the rows.
@@ -340,7 +340,7 @@ def check_rows(
         labels: (n,) classes or numbers; None, "" and NaN are no label.
         groups: (n,) names.
         split: (n,) "train", "val" or "test" for the rows that take part.
-        measured: labels are continuous.
+        regression: labels are continuous.
         tested: whether rows of test are needed. Without, rows of train are enough.
 
     Raises:
@@ -356,7 +356,7 @@ def check_rows(
             f"A probe needs features (n, d) and n labels, groups and splits, not {x.shape} and "
             f"{sizes}."
         )
-    y, names, has_label = _parse_labels(values, measured)
+    y, names, has_label = _parse_labels(values, regression)
     data = LabelledFeatures(x, y, names, groups)
     rows = Split(
         np.flatnonzero((split == "train") & has_label),
@@ -376,7 +376,7 @@ def check_rows(
             notes.append(
                 f"{len(shared)} groups lie in both train and {part}: these are not independent"
             )
-    if not measured:
+    if not regression:
         notes += unlearned_note(y[rows.test], np.unique(y[rows.fit]), names)
     return data, rows, tuple(notes)
 
@@ -412,20 +412,20 @@ def _check_used(data: LabelledFeatures, rows: Split) -> None:
 
 def _check_labels(data: LabelledFeatures, rows: Split, tested: bool) -> None:
     """Raise UserError for labels that nothing can be learned from, or that cannot be scored."""
-    measured = not len(data.names)
+    regression = not len(data.names)
     learned = np.unique(data.y[rows.fit])
     truth = data.y[rows.test]
     if len(learned) < 2:
-        if measured:
+        if regression:
             value = f"{learned[0]:g}"
         else:
             value = repr(str(data.names[learned[0]]))
         raise UserError(
             f"The label is {value} on every row of train. A probe needs at least two values."
         )
-    if measured and tested and np.ptp(truth) == 0:
+    if regression and tested and np.ptp(truth) == 0:
         raise UserError(f"The label is {truth[0]:g} on every row of test. R2 has no meaning there.")
-    if tested and not measured and not np.isin(truth, learned).any():
+    if tested and not regression and not np.isin(truth, learned).any():
         raise UserError(
             "No class of test is in train. Take another label, or let `anytouch probe tasks` split "
             "again."
@@ -441,12 +441,12 @@ def unlearned_note(tested: Array, learned: Array, names: Array) -> list[str]:
     return [f"{len(unknown)} test rows of classes that train lacks count as errors: {listed}"]
 
 
-def _parse_labels(values: Array, measured: bool) -> tuple[Array, Array, Array]:
+def _parse_labels(values: Array, regression: bool) -> tuple[Array, Array, Array]:
     """Return class numbers (-1: no label) or floats of labels (n,).
 
     Then come the sorted class names, and which rows have a label.
     """
-    if measured:
+    if regression:
         known = [np.nan if value in (None, "") else value for value in values]
         try:
             y = np.array([float(value) for value in known], np.float64)

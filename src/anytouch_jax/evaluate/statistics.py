@@ -15,7 +15,7 @@ import numpy.typing as npt
 from scipy.stats import rankdata
 
 Array = npt.NDArray[Any]
-Protocol = Literal["honest", "published"]
+Protocol = Literal["grouped", "released"]
 Interval = tuple[float | None, float | None]
 # sums (..., k) over rows -> a score (...)
 Metric = Callable[[Array], Array]
@@ -23,6 +23,7 @@ Metric = Callable[[Array], Array]
 # the controls of probes
 RAW = "raw pixels"
 RANDOM = "random encoder"
+IMAGENET = "ImageNet network"  # where its package is installed, see `weights.registry.INSTALLED`
 
 # Bootstraps of an interval. Its ends are 0.03 standard errors off; a tenth of the draws gives 0.09.
 DRAWS = 10_000
@@ -111,21 +112,21 @@ def _spearman_of(sums: Array) -> Array:
     return np.asarray(both / np.sqrt(np.where(has_spread, own * true, np.nan)))
 
 
-def _metric(measured: bool) -> Metric:
-    if measured:
+def _metric(regression: bool) -> Metric:
+    if regression:
         return _r2_of
     return _mean_of
 
 
 def paired_gain(
-    real: Sequence[GroupSums], other: Sequence[GroupSums], measured: bool
+    real: Sequence[GroupSums], other: Sequence[GroupSums], regression: bool
 ) -> dict[str, float | None]:
     """Return by how much the score of `real` is above that of `other`, with its 95 % interval.
 
     Both are scored on the same rows, and every draw takes the same groups for both. What makes a
     group hard for both cancels, so this interval is narrower than the two separate ones suggest.
     """
-    metric = _metric(measured)
+    metric = _metric(regression)
     width = real[0].sums.shape[1]
 
     def gain(sums: Array) -> Array:
@@ -217,11 +218,12 @@ def mean_interval(values: Array, groups: Array) -> Interval:
 
 
 def scores(
-    runs: Sequence[GroupSums], baselines: Sequence[GroupSums], measured: bool
+    runs: Sequence[GroupSums], baselines: Sequence[GroupSums], regression: bool
 ) -> dict[str, Any]:
     """Return mean, interval, values and chance of accuracy.
 
-    If `measured` they are of R2, with the mean absolute error and Spearman's correlation beside it.
+    With `regression` they are of R2, with the mean absolute error and Spearman's correlation
+    beside it.
 
     There is a run, and a baseline that predicts a constant, for each seed.
     """
@@ -229,17 +231,17 @@ def scores(
     def values(of: Metric, several: Sequence[GroupSums]) -> list[float]:
         return [float(of(run.sums.sum(0))) for run in several]
 
-    metric = _metric(measured)
-    low, high = _bootstrap_interval(runs, metric) if measured else _fraction_interval(runs)
+    metric = _metric(regression)
+    low, high = _bootstrap_interval(runs, metric) if regression else _fraction_interval(runs)
     result: dict[str, Any] = {
-        "metric": "r2" if measured else "accuracy",
+        "metric": "r2" if regression else "accuracy",
         "mean": float(np.mean(values(metric, runs))),
         "low": low,
         "high": high,
         "values": values(metric, runs),
         "chance": float(np.mean(values(metric, baselines))),
     }
-    if measured:
+    if regression:
         mae_low, mae_high = _bootstrap_interval(runs, _mae_of)
         rank_low, rank_high = _bootstrap_interval(runs, _spearman_of)
         rank = float(np.mean(values(_spearman_of, runs)))

@@ -79,7 +79,7 @@ def as_text(value: Any) -> str:
     return re.sub(r"[\\`*\[\]~]|(?<![^\W_])_|_(?![^\W_])", r"\\\g<0>", text)
 
 
-def share_text(value: float | None) -> str:
+def fraction_text(value: float | None) -> str:
     """Return a fraction in percent as text, "-" if there is none."""
     if value is None or np.isnan(value):
         return "-"

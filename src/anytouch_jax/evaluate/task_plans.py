@@ -110,7 +110,7 @@ def _plan(
         patterns = sides[side]
         if patterns:
             notes.append(f"{side.replace('_', ' ')} {', '.join(patterns)}")
-    if scheme == "split" and not roles.measured:
+    if scheme == "split" and not roles.regression:
         notes += splits.unlearned_note(roles.y[roles.tested], roles.y[roles.fitted], names)
     notes = [note for note in notes if note]
     return Plan(task, rows, roles, names, options.frames or task.frames, notes)

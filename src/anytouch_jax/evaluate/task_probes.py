@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from anytouch_jax.data.background.rule import UnitGels
+from anytouch_jax.data.background.rule import Backgrounds
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder.arrays import Log
@@ -24,8 +24,10 @@ from anytouch_jax.evaluate.task_scores import score_source
 from anytouch_jax.evaluate.tasks import TaskRows
 from anytouch_jax.evaluate.verdicts import Runs, task_verdicts
 from anytouch_jax.files import atomic_write
+from anytouch_jax.renamed import PROTOCOLS, keywords
 
 
+@keywords({"protocol": PROTOCOLS}, join="aggregation")
 def probe_tasks(
     models: Models,
     data: Paths | Manifest,
@@ -49,7 +51,7 @@ def probe_tasks(
         models: names, run folders or weights files of encoders.
         data: manifests, or one that was read.
         tasks: names of `tasks.TASKS` or tasks, or "all" of which the manifest has labels.
-        options: all settings; see `TaskProbeOptions`. Protocol "published" reports both.
+        options: all settings; see `TaskProbeOptions`. Protocol "released" reports both.
         keep: gets the test rows of every seed, to compare sources on the same rows.
         log: is called with sentences on what is done.
         changes: settings by name, such as `seeds=3`: fields of `TaskProbeOptions`.
@@ -62,22 +64,22 @@ def probe_tasks(
     if options.seeds < 1:
         raise UserError(f"seeds must be at least 1, not {options.seeds}.")
     table = data if isinstance(data, Manifest) else manifests.read([str(path) for path in data])
-    gels = UnitGels(table)
+    backgrounds = Backgrounds(table)
     # Opened when the first task has passed its checks, so a wrong word is refused before a load.
     opened = cache(lambda: sources.opened(models))
 
     def among(rows: TaskRows) -> TaskRows:
-        return sources.with_gel(rows, gels, opened())
+        return sources.with_gel(rows, backgrounds, opened())
 
     plans, left_out = plan_tasks(table, tasks, options, among, log)
-    probed = _sources(table, opened(), plans, options, gels, log)
+    probed = _sources(table, opened(), plans, options, backgrounds, log)
     runs: Runs = {} if keep is None else keep
     results: list[dict[str, Any]] = []
     for source in probed:
         # the cost is that of every source, so it is told once
         results += score_source(source, plans, options, runs, log if not results else _silent)
         log(f"probed {source.name}")
-    kinds = {plan.task.name: plan.roles.measured for plan in plans}
+    kinds = {plan.task.name: plan.roles.regression for plan in plans}
     report = {
         "manifest": table.content_hash,
         "data": [str(path) for path in table.files],
@@ -102,6 +104,7 @@ def _silent(_: str) -> None:
     """Log nothing."""
 
 
+@keywords({"protocol": PROTOCOLS}, join="aggregation")
 def probe_benchmark(
     models: Models, data: Paths | Manifest, benchmark: str, **options: Any
 ) -> dict[str, Any]:
@@ -122,7 +125,7 @@ def probe_benchmark(
         data,
         [setting.task],
         heads=("gradient",),
-        protocol="published",
+        protocol="released",
         pooling=setting.pooling,
         universal=setting.universal,
         recipe=setting.recipe,
@@ -136,7 +139,7 @@ def _sources(
     opened: sources.Opened,
     plans: Sequence[Plan],
     options: TaskProbeOptions,
-    gels: UnitGels,
+    backgrounds: Backgrounds,
     log: Log,
 ) -> list[FeatureSource]:
     """Return the sources of features, with those of all tasks computed in one pass.
@@ -152,14 +155,14 @@ def _sources(
     for length in sorted({plan.frames for plan in plans}):
         parts = [plan.rows.rows.ravel() for plan in plans if plan.frames == length]
         rows[length] = np.concatenate(parts)
-    log(gels.report(np.unique(np.concatenate(list(rows.values())))))
+    log(backgrounds.report(np.unique(np.concatenate(list(rows.values())))))
     encoding = feature_cache.Encoding(
         pooling=options.pooling,
-        join=options.join,
+        aggregation=options.aggregation,
         order=options.order,
         universal=options.universal,
         folder=options.cache,
-        gels=gels,
+        backgrounds=backgrounds,
     )
     frames = options.frames or 1
     found = sources.gather_sources(
@@ -173,6 +176,8 @@ def _sources(
     )
     encoders = [source.encoder for source in found if source.encoder]
     has_single = any(frames <= encoder.config.model.frames for encoder in encoders)
-    if options.join != "mean" and has_single:
-        raise UserError("--join has no effect without --frames longer than a clip of the model.")
+    if options.aggregation != "mean" and has_single:
+        raise UserError(
+            "--aggregation has no effect without --frames longer than a clip of the model."
+        )
     return found

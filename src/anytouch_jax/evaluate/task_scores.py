@@ -44,8 +44,8 @@ def score_source(
         wanted = [plan.rows.rows.ravel() for plan in plans if plan.frames == length]
         source.store.add(np.concatenate(wanted), length)
     protocols: tuple[Protocol, ...] = (options.protocol,)
-    if options.protocol == "published":
-        protocols = ("honest", "published")
+    if options.protocol == "released":
+        protocols = ("grouped", "released")
     recipe = options.recipe or GradientRecipe()
     results = []
     for plan in tracked(plans, f"tasks with {source.name}"):
@@ -110,7 +110,7 @@ def _score(
     baselines = list[GroupSums]()
     for seed in tracked(range(seeds), "splits"):
         cuts = splits.seeded_splits(roles, seed, protocol)
-        nothing_drawn = protocol == "published" and len(cuts) == 1 and head.name != "gradient"
+        nothing_drawn = protocol == "released" and len(cuts) == 1 and head.name != "gradient"
         if seed and nothing_drawn:
             runs.append(runs[0])  # every seed is the same fit
             continue
@@ -126,8 +126,8 @@ def _score(
         tested = np.concatenate([cut.test for cut in cuts])
         runs.append(score_sums(data, np.concatenate(predicted), tested))
         baselines.append(score_sums(data, np.concatenate(constant), tested))
-    scores = statistics.scores(runs, baselines, roles.measured)
-    if roles.measured:
+    scores = statistics.scores(runs, baselines, roles.regression)
+    if roles.regression:
         scores["unit"] = plan.task.unit
     notes = []
     if tally.unfinished:

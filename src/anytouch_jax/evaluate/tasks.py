@@ -122,7 +122,7 @@ def _benchmark(dataset: str, task: Task, paper: float, **settings: Any) -> Bench
 
 # Paper, appendix "Downstream Datasets" and Tables 1 to 3; released code,
 # run_probe_{TAG,Feel,OF1,OF2}.sh, main_probe.py and downstream_dataset.py. A batch is of two
-# devices together. Features are computed once, so training pictures are not augmented: the release
+# devices together. Features are computed once, so training images are not augmented: the release
 # flips and jitters them, except for ObjectFolder 2.0.
 _TAG = GradientRecipe(batch=128, rate=2e-4, decay=0.05)
 _FEEL = GradientRecipe(batch=256, rate=1e-3, decay=0.05)
@@ -296,7 +296,7 @@ def find_column(table: Manifest, name: str) -> str:
 def described_subsets(table: Manifest, column: str, rows: Array, name: str) -> dict[str, Array]:
     """Return masks over `rows` (n,): values of `column` that alignment may have named, and others.
 
-    Those are values with a photograph or caption in train. {} if all values are of one kind.
+    Those are values with an RGB image or caption in train. {} if all values are of one kind.
     """
     values = table.text_column(column)
     described = (table.present("image_path") | table.present("text")) & (
@@ -305,7 +305,7 @@ def described_subsets(table: Manifest, column: str, rows: Array, name: str) -> d
     mask = np.isin(values[rows], np.setdiff1d(values[described], [""]))
     if mask.all() or not mask.any():
         return {}
-    return {f"{name} with a photograph or caption": mask, f"{name} without": ~mask}
+    return {f"{name} with an RGB image or caption": mask, f"{name} without": ~mask}
 
 
 def select(table: Manifest, task: Task, frames: int | None = None) -> TaskRows:
@@ -376,7 +376,7 @@ def _split(table: Manifest, task: Task) -> Array:
 
 
 def _takes_part(table: Manifest, task: Task, labels: Array, split: Array, frames: int) -> Array:
-    """Return which rows have a label and picture, a split that counts, and pass the filters."""
+    """Return which rows have a label and image, a split that counts, and pass the filters."""
     if labels.dtype.kind == "U":
         used = labels != ""
     else:
@@ -411,7 +411,7 @@ def label_text(value: Any, source: str = "The label") -> str:
     if not np.isfinite(value) or value != int(value):
         raise UserError(
             f"{source} contains {value:g}, a measured quantity, not a class. Probe it with "
-            "--regression yes, or in Python with measured=True."
+            "--regression yes, or in Python with regression=True."
         )
     return str(int(value))
 
@@ -480,7 +480,7 @@ def _touching(table: Manifest) -> Array:
 
     In a file without these all frames are.
     """
-    # Force comes first: a flag or a score depends on the picture, and would leave out soft objects
+    # Force comes first: a flag or a score depends on the image, and would leave out soft objects
     # for some sensors.
     measures = (
         (table.number_column("label.force"), FORCE),

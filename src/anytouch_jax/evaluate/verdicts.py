@@ -36,13 +36,13 @@ class Scored(NamedTuple):
             return f"the {self.features}"
         return f"{self.features} ({self.head})"
 
-    def gain(self, other: Scored, measured: bool) -> dict[str, float | None]:
+    def gain(self, other: Scored, regression: bool) -> dict[str, float | None]:
         """Return by how much it is above another one, with the paired interval."""
-        return statistics.paired_gain(self.runs, other.runs, measured)
+        return statistics.paired_gain(self.runs, other.runs, regression)
 
 
 def verdict(
-    name: str, gain: Gain, control: str = "raw pixels", task: str = "", measured: bool = False
+    name: str, gain: Gain, control: str = "raw pixels", task: str = "", regression: bool = False
 ) -> str:
     """Return a sentence on features against a control, from a `paired_gain`.
 
@@ -51,13 +51,13 @@ def verdict(
         gain: of the features over the control.
         control: the best one.
         task: what was probed, if there are several tasks.
-        measured: the gain is of R2, not of an accuracy.
+        regression: the gain is of R2, not of an accuracy.
     """
     of = f"{task}: " if task else ""
-    by = _by(gain, measured)
+    by = _by(gain, regression)
     if gain["low"] is None:
         return f"{of}{name} is {by} from {control}, by too few test recordings to be sure."
-    interval = _interval(gain, measured)
+    interval = _interval(gain, regression)
     if gain["low"] > 0:
         by = by.removeprefix("+")
         return f"{of}{name} is {by} above the best control, {control} {interval}."
@@ -68,53 +68,53 @@ def verdict(
     )
 
 
-def _by(gain: Gain, measured: bool) -> str:
+def _by(gain: Gain, regression: bool) -> str:
     """Return a difference with its sign and unit."""
     difference = gain["difference"] or 0.0
-    if measured:
+    if regression:
         return f"{difference:+.2f} of R2"
     return f"{100 * difference:+.0f} points"
 
 
-def _interval(gain: Gain, measured: bool) -> str:
+def _interval(gain: Gain, regression: bool) -> str:
     low = gain["low"] or 0.0
     high = gain["high"] or 0.0
-    if measured:
+    if regression:
         return f"({low:.2f} to {high:.2f})"
     return f"({100 * low:.0f} to {100 * high:.0f})"
 
 
-def _untrained(own: Scored, untrained: Scored, task: str, measured: bool) -> str:
+def _untrained(own: Scored, untrained: Scored, task: str, regression: bool) -> str:
     """Return a sentence where an untrained encoder is above a trained one, else "".
 
-    Then what the score shows is the architecture and the pictures, not what training has taught.
+    Then what the score shows is the architecture and the images, not what training has taught.
     """
-    gain = untrained.gain(own, measured)
+    gain = untrained.gain(own, regression)
     if (gain["difference"] or 0.0) <= 0:
         return ""
     of = f"{task}: " if task else ""
     sure = "" if (gain["low"] or 0.0) > 0 else ", which may be chance"
-    by = _by(gain, measured).removeprefix("+")
-    interval = "" if gain["low"] is None else f" {_interval(gain, measured)}"
+    by = _by(gain, regression).removeprefix("+")
+    interval = "" if gain["low"] is None else f" {_interval(gain, regression)}"
     line = f"{of}{untrained.name} is {by} better than {own.name}{interval}{sure}."
     return line[0].upper() + line[1:]
 
 
 def sentences(
-    own: Scored, controls: Sequence[Scored], task: str = "", measured: bool = False
+    own: Scored, controls: Sequence[Scored], task: str = "", regression: bool = False
 ) -> list[str]:
     """Return what is to say of a head on features of a user, beside the controls of a probe."""
     if not controls:
         return []
     # the control over which the features gain least
-    gains = [own.gain(control, measured) for control in controls]
+    gains = [own.gain(control, regression) for control in controls]
     place = min(range(len(gains)), key=lambda number: gains[number]["difference"] or 0.0)
     best = controls[place]
-    lines = [verdict(own.name, gains[place], best.name, task, measured)]
+    lines = [verdict(own.name, gains[place], best.name, task, regression)]
     untrained = [control for control in controls if control.features == RANDOM]
     if untrained and best.features != RANDOM:
-        lowest = min(untrained, key=lambda one: own.gain(one, measured)["difference"] or 0.0)
-        line = _untrained(own, lowest, task, measured)
+        lowest = min(untrained, key=lambda one: own.gain(one, regression)["difference"] or 0.0)
+        line = _untrained(own, lowest, task, regression)
         if line:
             lines.append(line)
     return lines
@@ -128,11 +128,11 @@ def label_verdicts(results: Sequence[ProbeResult]) -> list[str]:
     """
     scored: list[Scored] = []
     constants: list[Scored] = []
-    measured = False
+    regression = False
     for result in results:
         if result.outcome is None:
             continue
-        measured = result.measured
+        regression = result.regression
         features, has_head, head = result.probe.rpartition(": ")
         if has_head:
             scored.append(Scored(features, head, [result.outcome.sums]))
@@ -146,7 +146,7 @@ def label_verdicts(results: Sequence[ProbeResult]) -> list[str]:
     for one in scored:
         if one.features not in CONTROLS and one.features not in judged:
             judged.add(one.features)
-            lines += sentences(one, controls, measured=measured)
+            lines += sentences(one, controls, regression=regression)
     return lines
 
 

@@ -125,8 +125,8 @@ class Exported:
             return np.asarray(self._run(arrays.filled(frames), arrays.filled(rows)))[: len(frames)]
 
     @property
-    def gels(self) -> dict[str, np.ndarray]:
-        """Pictures RGB u8 (h, w, 3) of the untouched gel, by unit.
+    def backgrounds(self) -> dict[str, np.ndarray]:
+        """Images RGB u8 (h, w, 3) of the untouched gel, by unit.
 
         They are those of the touches that int8 was calibrated on.
         """

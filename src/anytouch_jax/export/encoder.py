@@ -17,11 +17,12 @@ import numpy as np
 
 from anytouch_jax.batch import FieldOutput
 from anytouch_jax.config import UNIVERSAL, from_json
-from anytouch_jax.encoder.arrays import METADATA, Engine, Join, Pooling, rows_of_sensors
+from anytouch_jax.encoder.arrays import METADATA, Aggregation, Engine, Pooling, rows_of_sensors
 from anytouch_jax.encoder.base import Encoder, as_clips
 from anytouch_jax.encoder.measured import missing
 from anytouch_jax.errors import UserError
 from anytouch_jax.export.export import Exported, load
+from anytouch_jax.renamed import keywords
 
 
 @dataclass(frozen=True, repr=False)
@@ -44,9 +45,9 @@ class EngineEncoder(Encoder):
         return str(self.run.about["sha256"])
 
     @property
-    def gels(self) -> dict[str, np.ndarray]:
-        """Pictures of the untouched gel by unit, of the touches that int8 was calibrated on."""
-        return self.run.gels
+    def backgrounds(self) -> dict[str, np.ndarray]:
+        """Images of the untouched gel by unit, of the touches that int8 was calibrated on."""
+        return self.run.backgrounds
 
     @property
     def runs_in_jax(self) -> bool:
@@ -72,19 +73,23 @@ class EngineEncoder(Encoder):
             raise UserError(f"{self.source} is computed in float32 or int8; leave out --dtype")
         return self
 
-    def traceable(self, pooling: Pooling = "class", join: Join = "mean") -> Callable[..., Any]:
+    @keywords(join="aggregation")
+    def traceable(
+        self, pooling: Pooling = "class", aggregation: Aggregation = "mean"
+    ) -> Callable[..., Any]:
         """Raise UserError: it has no parameters for jax."""
         raise UserError(
             f"{self.source} has no parameters for jax; name the encoder that it was exported from"
         )
 
+    @keywords(join="aggregation")
     def encode_touch(
         self,
         frames: Any,
         sensor: str | Sequence[str] | np.ndarray = UNIVERSAL,
         *,
         pooling: Pooling = "class",
-        join: Join = "mean",
+        aggregation: Aggregation = "mean",
     ) -> np.ndarray:
         """Return features f32 (B, E) of touches of the exported length, as `Encoder.encode_touch`.
 

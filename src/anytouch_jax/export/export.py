@@ -23,7 +23,7 @@ from anytouch_jax.config import to_json
 from anytouch_jax.data.images import encode
 from anytouch_jax.doors import HEADS, enter
 from anytouch_jax.encoder import arrays
-from anytouch_jax.encoder.arrays import METADATA, Array, Join, Params, Pooling
+from anytouch_jax.encoder.arrays import METADATA, Aggregation, Array, Params, Pooling
 from anytouch_jax.errors import CheckError, UserError
 from anytouch_jax.export import engines
 from anytouch_jax.export.artefact import FORMAT, describes, platform_here
@@ -54,8 +54,8 @@ features = run(["features"], {{"frames": frames, "sensor": sensor}})[0]  # {shap
     "fields": """import numpy
 import onnxruntime
 run = onnxruntime.InferenceSession({name!r}).run
-# Of {sensor}: the mm that the width of its picture shows, the kPa of its gel, and the logarithm of
-# the height over the width of its picture.
+# Of {sensor}: the mm that the width of its image shows, the kPa of its gel, and the logarithm of
+# the height over the width of its image.
 width_mm, modulus_kpa, aspect = {width_mm}, {modulus_kpa}, {aspect}
 given = {{"frames": frames, "sensor": sensor}}  # {shape}, int32 (B,)
 given["aspect"] = numpy.full(len(frames), aspect, numpy.float32)
@@ -73,11 +73,11 @@ class ExportSettings:
         frames: those of a touch.
         platforms: those that a jax artefact runs on.
         pooling: see `Encoder.encode_touch`.
-        join: the temporal aggregation of a long clip.
+        aggregation: the temporal aggregation of a long clip.
         form: a jax artefact, or ONNX, which is float32 and for CPUs.
         calibration: touches u8 (200, T, H, W, 3) and sensor rows i32 (200,). With these, the linear
             layers of ONNX become int8.
-        gels: pictures of the untouched gel by unit, which are stored in the description.
+        backgrounds: images of the untouched gel by unit, which are stored in the description.
         fields: ONNX has the outputs of `fields.module` too.
         engine: on which ONNX is compared with the live model.
     """
@@ -85,10 +85,10 @@ class ExportSettings:
     frames: int = 1
     platforms: Sequence[str] = ("cpu", "cuda")
     pooling: Pooling = "class"
-    join: Join = "mean"
+    aggregation: Aggregation = "mean"
     form: Literal["jax", "onnx"] = "jax"
     calibration: tuple[np.ndarray, np.ndarray] | None = field(default=None, repr=False)
-    gels: Mapping[str, np.ndarray] | None = field(default=None, repr=False)
+    backgrounds: Mapping[str, np.ndarray] | None = field(default=None, repr=False)
     fields: bool = False
     engine: Engine = "onnxruntime"
 
@@ -100,10 +100,10 @@ def export(  # noqa: PLR0913  the public call; `export_with` takes the record
     frames: int = 1,
     platforms: Sequence[str] = ("cpu", "cuda"),
     pooling: Pooling = "class",
-    join: Join = "mean",
+    aggregation: Aggregation = "mean",
     form: Literal["jax", "onnx"] = "jax",
     calibration: tuple[np.ndarray, np.ndarray] | None = None,
-    gels: Mapping[str, np.ndarray] | None = None,
+    backgrounds: Mapping[str, np.ndarray] | None = None,
     fields: bool = False,
     engine: Engine = "onnxruntime",
 ) -> dict[str, Any]:
@@ -115,10 +115,10 @@ def export(  # noqa: PLR0913  the public call; `export_with` takes the record
         frames: see `ExportSettings`.
         platforms: see `ExportSettings`.
         pooling: see `ExportSettings`.
-        join: see `ExportSettings`.
+        aggregation: see `ExportSettings`.
         form: see `ExportSettings`.
         calibration: see `ExportSettings`.
-        gels: see `ExportSettings`.
+        backgrounds: see `ExportSettings`.
         fields: see `ExportSettings`.
         engine: see `ExportSettings`.
     """
@@ -126,10 +126,10 @@ def export(  # noqa: PLR0913  the public call; `export_with` takes the record
         frames=frames,
         platforms=platforms,
         pooling=pooling,
-        join=join,
+        aggregation=aggregation,
         form=form,
         calibration=calibration,
-        gels=gels,
+        backgrounds=backgrounds,
         fields=fields,
         engine=engine,
     )
@@ -253,13 +253,13 @@ def _description(
             **units,
         }
         about["aspect"] = (
-            "float32 (B,): the logarithm of the height over the width that the picture shows"
+            "float32 (B,): the logarithm of the height over the width that the image shows"
         )
     if made.int8 is not None:
         about["int8"] = made.int8
     blank = encoder.blank
     shape = f"{blank.dtype} (B, {settings.frames}, {', '.join(map(str, blank.shape))})"
-    pictures = settings.gels or {}
+    images = settings.backgrounds or {}
     text = _EXAMPLE["fields" if settings.fields else settings.form]
     return about | {
         "source": encoder.source,
@@ -270,12 +270,12 @@ def _description(
         "features": made.width,
         "background": encoder.config.data.background,
         "pooling": settings.pooling,
-        "join": settings.join,
+        "join": settings.aggregation,
         "dtype": encoder.config.model.dtype,
         "sensors": {name: row for row, name in enumerate(model.sensors)},
         "trained_sensors": None if trained is None else list(trained),
         "worst_difference": made.worst,
-        "gels": {name: b64encode(encode(gel)).decode() for name, gel in pictures.items()},
+        "gels": {name: b64encode(encode(gel)).decode() for name, gel in images.items()},
         "example": text.format(name=path.name, shape=shape, **example),
     }
 
@@ -284,7 +284,7 @@ def _artefact(encoder: Encoder, settings: ExportSettings) -> bytes:
     """Return a jax artefact for any number of touches."""
     (batch,) = jax_export.symbolic_shape("b")
     blank = encoder.blank
-    run = partial(encoder.traceable(settings.pooling, settings.join), encoder.params)
+    run = partial(encoder.traceable(settings.pooling, settings.aggregation), encoder.params)
     touches = jax.ShapeDtypeStruct((batch, settings.frames, *blank.shape), blank.dtype)
     rows = jax.ShapeDtypeStruct((batch,), np.int32)
     platforms = tuple(settings.platforms)
@@ -314,7 +314,9 @@ def _worst(encoder: Encoder, run: Any, settings: ExportSettings) -> tuple[float,
             exported, theirs = run(clips, rows, aspect)
             worst = max(worst, _worst_field(mine, theirs))
         else:
-            live = encoder.encode_touch(clips, rows, pooling=settings.pooling, join=settings.join)
+            live = encoder.encode_touch(
+                clips, rows, pooling=settings.pooling, aggregation=settings.aggregation
+            )
             exported = np.asarray(run(clips, rows))
         is_finite = np.isfinite(exported).all() and np.isfinite(live).all()
         if exported.shape != live.shape or not is_finite:

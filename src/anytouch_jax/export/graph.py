@@ -29,6 +29,7 @@ from anytouch_jax.fields.outputs import (
     TOUCHED_BORDER,
 )
 from anytouch_jax.fields.poisson import border, inverse_spectrum, transforms
+from anytouch_jax.nn.sight import BLOCKS, MIDDLE, RANGE, READ
 
 OPSET = 20  # the first with Gelu
 BLOCK = "block"  # start of the names of nodes in blocks
@@ -125,6 +126,9 @@ def touch_graph(params: Any, model: ModelConfig, frames: int, pooling: Pooling =
         x = graph.norm(x, touch["pre_norm"], model.norm_eps)
     states = _blocks(graph, x, touch, model, only_class=pooling == "class" and not measures)
     values = _pooled(graph, states[-1], touch, model, pooling)
+    width = len(values) * model.embed + model.sight
+    if model.sight:
+        values.append(_sight(graph, touch["sight"], frames))
     graph.nodes.append(helper.make_node("Concat", values, ["features"], "features", axis=-1))
 
     side = model.image_size
@@ -133,7 +137,7 @@ def touch_graph(params: Any, model: ModelConfig, frames: int, pooling: Pooling =
         about("frames", TensorProto.UINT8, ("B", frames, side, side, 3)),
         about("sensor", TensorProto.INT32, "B"),
     ]
-    outputs = [about("features", TensorProto.FLOAT, ("B", len(values) * model.embed))]
+    outputs = [about("features", TensorProto.FLOAT, ("B", width))]
     if measures:
         inputs.append(about("aspect", TensorProto.FLOAT, "B"))
         own = jax.tree.map(np.asarray, params["fields"])
@@ -252,6 +256,51 @@ def _block(graph: Graph, x: str, block: Any, model: ModelConfig, *, first: bool)
     return graph("Add", x, graph.dense(y, block["mlp"]["down"]))
 
 
+def _sight(graph: Graph, own: Any, frames: int) -> str:
+    """Return the values (B, model.sight) of the trunk (`nn.sight.Sight`) for the last frame."""
+    graph.part = "sight."
+    x = graph("Cast", graph.one_of("frames", frames - 1, 1), to=_FLOAT32)
+    x = graph("Div", graph("Sub", x, float(MIDDLE)), float(RANGE))
+    x = graph("Transpose", x, perm=[0, 3, 1, 2])
+    x = _clipped(graph, _same_convolution(graph, x, own["trunk"]["stem"], 3, 2))
+    means = []
+    for number, form in enumerate(BLOCKS):
+        block = own["trunk"][f"block{number}"]
+        y = x
+        if "wide" in block:
+            y = _clipped(graph, _same_convolution(graph, y, block["wide"], 1, 1))
+        y = _same_convolution(graph, y, block["depth"], form.side, form.stride, form.inside)
+        y = _same_convolution(graph, _clipped(graph, y), block["narrow"], 1, 1)
+        is_residual = form.stride == 1 and number and form.outputs == BLOCKS[number - 1].outputs
+        x = graph("Add", x, y) if is_residual else y
+        if number in READ:
+            means.append(graph("ReduceMean", x, [2, 3], keepdims=0))
+    values = graph.dense(graph("Concat", *means, axis=-1), own["read"])
+    graph.part = ""
+    return values
+
+
+def _same_convolution(
+    graph: Graph, x: str, part: Any, side: int, stride: int, groups: int = 1
+) -> str:
+    """Add a convolution of maps (B, C, H, W), padded as in `nn.sight`."""
+    kernel = part["kernel"].reshape(side, side, -1, part["kernel"].shape[-1])
+    return graph(
+        "Conv",
+        x,
+        kernel.transpose(3, 2, 0, 1),
+        part["bias"],
+        kernel_shape=[side] * 2,
+        auto_pad="SAME_UPPER",
+        strides=[stride] * 2,
+        group=groups,
+    )
+
+
+def _clipped(graph: Graph, x: str) -> str:
+    return graph("Clip", x, 0.0, 6.0)
+
+
 class _FieldGraph:
     """The decoder of fields (`fields.module.FieldDecoder`) as nodes of a graph, layer by layer."""
 
@@ -314,7 +363,7 @@ class _FieldGraph:
         quarter = (self._half + 1) // 2
         eighth = (self._half + 3) // 4
         deep = self._refined(self._convolved(x, "deep", 2), "deep1", "deep2")
-        # The whole picture shows the lights of the unit.
+        # The whole image shows the lights of the unit.
         mean = graph("ReduceMean", deep, [1, 2], keepdims=1)
         light = graph.dense(graph("Gelu", mean), self._own["light"])
         deep = self._refined(graph("Add", deep, light), "deep3", "deep4")

@@ -5,18 +5,18 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from anytouch_jax.data.background.layout import UnitFrames, check_layout, known_gels
+from anytouch_jax.data.background.layout import UnitFrames, check_layout, known_backgrounds
 from anytouch_jax.encoder.arrays import Array
 from anytouch_jax.errors import UserError
 
-# Differences of the logarithm of height over width: that of a turned or cropped picture, and that
+# Differences of the logarithm of height over width: that of a turned or cropped image, and that
 # between a frame and its own background, which should have none.
 SHAPE_LIMIT = 0.1
 _SAME_SHAPE = 0.03
-_GREY = 2  # levels by which colours of a grey picture differ
-_SIDE = 40  # pixels of a picture's width, when compared with its background
-# A turned picture must fit its background better by this factor, and by a level more. Of simulated
-# presses, 4 % look exchanged by a factor of up to 1.17, because a press covers a part of a picture.
+_GREY = 2  # levels by which colours of a grey image differ
+_SIDE = 40  # pixels of an image's width, when compared with its background
+# A turned image must fit its background better by this factor, and by a level more. Of simulated
+# presses, 4 % look exchanged by a factor of up to 1.17, because a press covers a part of an image.
 _FACTOR = 1.2
 _LEVEL = 1
 
@@ -28,9 +28,9 @@ def faults_of(
 
     Args:
         frame: RGB u8 (h, w, 3).
-        background: the picture of its untouched gel.
+        background: the image of its untouched gel.
         sensor: its name.
-        shape: the height of its pictures over their width, None if nobody knows it.
+        shape: the height of its images over their width, None if nobody knows it.
 
     Raises:
         UserError: frame and background show different parts of the gel.
@@ -48,13 +48,13 @@ def faults_of(
     faults = list[str]()
     if shape is not None and abs(np.log(height / (width * shape))) > SHAPE_LIMIT:
         faults.append(
-            f"a picture of {sensor} has a height of {shape:.3g} widths, and this one has {width} x "
+            f"an image of {sensor} has a height of {shape:.3g} widths, and this one has {width} x "
             f"{height} pixels. Turn it, or name the width that it shows (width_mm)."
         )
     few = frame[::4, ::4].astype(np.int16)
     if np.abs(few - few[..., :1]).max() <= _GREY:
         # The other checks compare colours.
-        faults.append("the picture is grey, and colours show the slopes. Read it in colour.")
+        faults.append("the image is grey, and colours show the slopes. Read it in colour.")
         return tuple(faults)
     if background is not None:
         turned = _unlike(frame, background)
@@ -69,7 +69,7 @@ def faults_of(
     # changes by 2 to 8 %). So a turn counts only without a background.
     check = check_layout(
         UnitFrames(sensor, "", [[frame]], background),
-        known_gels(sensor),
+        known_backgrounds(sensor),
         may_be_turned=background is not None,
     )
     if check.ok is False:
@@ -81,14 +81,14 @@ def _unlike(frame: Array, background: Array) -> str:
     """Return how a frame was turned or recoloured against its background, "" if it was not."""
     size = (_SIDE, max(1, round(_SIDE * frame.shape[0] / frame.shape[1])))
 
-    def small(picture: Array) -> Array:
-        return cv2.resize(picture, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    def small(image: Array) -> Array:
+        return cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
 
     own = small(frame)
     gel = small(background)
 
     def differs(other: Array) -> float:
-        # Medians, because a press covers the smaller part of a picture, and without what changes
+        # Medians, because a press covers the smaller part of an image, and without what changes
         # everywhere, because light drifts.
         change = other - gel
         return float(np.median(np.abs(change - np.median(change, axis=(0, 1))).max(2)))

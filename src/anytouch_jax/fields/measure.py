@@ -1,6 +1,6 @@
 """Touch in millimetres and newtons: depth, shear, contact and force of frames.
 
-The network's outputs are free of scale: lengths are fractions of the picture's width, stresses
+The network's outputs are free of scale: lengths are fractions of the image's width, stresses
 fractions of the gel's modulus. Here they get the scale of a sensor, and standard deviations.
 """
 
@@ -16,7 +16,7 @@ import numpy as np
 
 from anytouch_jax.batch import FieldOutput
 from anytouch_jax.data.background.dots import DotFlow
-from anytouch_jax.data.background.layout import known_gels as known_gels
+from anytouch_jax.data.background.layout import known_backgrounds as known_backgrounds
 from anytouch_jax.data.transforms import Flip, orient_frame
 from anytouch_jax.encoder.arrays import METADATA, Array, Log
 from anytouch_jax.encoder.measured import Fields as Fields
@@ -24,15 +24,15 @@ from anytouch_jax.encoder.measured import missing as missing
 from anytouch_jax.encoder.sensor_words import resolve_sensor
 from anytouch_jax.errors import UserError
 from anytouch_jax.fields.faults import faults_of as faults_of
+from anytouch_jax.fields.images import depth_levels as depth_levels
+from anytouch_jax.fields.images import overlay as overlay
+from anytouch_jax.fields.images import write_surface as write_surface
 from anytouch_jax.fields.outputs import FORCE, LENGTH, TORQUE
-from anytouch_jax.fields.pictures import depth_levels as depth_levels
-from anytouch_jax.fields.pictures import overlay as overlay
-from anytouch_jax.fields.pictures import write_surface as write_surface
 from anytouch_jax.sensors import RECORDS
 
 
 class KnownGel(NamedTuple):
-    """What a sensor shows: mm of the picture's width, its height over its width, the gel's kPa."""
+    """What a sensor shows: mm of the image's width, its height over its width, the gel's kPa."""
 
     width: float
     shape: float
@@ -62,10 +62,10 @@ class Scale(NamedTuple):
     """What turns outputs into mm and N.
 
     Attributes:
-        width: mm of the picture, or None.
+        width: mm of the image, or None.
         modulus: kPa of the gel.
         spread: the modulus' standard deviation as a fraction of it.
-        shape: height of the picture over its width, None if nobody knows it.
+        shape: height of the image over its width, None if nobody knows it.
         factors: by which deviations are multiplied, by name.
     """
 
@@ -82,15 +82,13 @@ def scale_of(metadata: Mapping[str, Any], sensor: str, width_mm: float | None = 
     Args:
         metadata: of the weights, which may hold factors on deviations and moduli of sensors.
         sensor: its name, or the folder of a fitted one. GELS knows the width of some.
-        width_mm: the mm that the picture's width shows, if it is another one.
+        width_mm: the mm that the image's width shows, if it is another one.
 
     Raises:
         UserError: a width that is no length, or damaged metadata.
     """
     if width_mm is not None and not 0 < width_mm < np.inf:
-        raise UserError(
-            f"the width of the picture must be a number of mm above 0, not {width_mm:g}"
-        )
+        raise UserError(f"the width of the image must be a number of mm above 0, not {width_mm:g}")
     try:
         stored = metadata.get(METADATA, {})
         stored = json.loads(stored) if isinstance(stored, str) else stored
@@ -109,7 +107,7 @@ def scale_of(metadata: Mapping[str, Any], sensor: str, width_mm: float | None = 
     if gel is None:
         modulus = moduli.get(word.name, OTHER_MODULUS)
         return Scale(width_mm, modulus, spread, shape=None, factors=factors)
-    # Another width is that of a cropped picture, whose shape nobody knows.
+    # Another width is that of a cropped image, whose shape nobody knows.
     shape = gel.shape if width_mm is None else None
     modulus = moduli.get(word.name, gel.modulus)
     return Scale(width_mm or gel.width, modulus, spread, shape=shape, factors=factors)
@@ -164,7 +162,7 @@ def fields_of(out: FieldOutput, scale: Scale, shape: float, faults: tuple[str, .
     Args:
         out: arrays (B, ...), see `batch.FieldOutput`.
         scale: that of the sensor.
-        shape: the picture's height over its width.
+        shape: the image's height over its width.
         faults: sentences. With some, no deviation is below the value itself.
     """
     out = FieldOutput._make(np.asarray(value, np.float32) for value in out)
@@ -284,8 +282,8 @@ def _dragged(measured: Fields, scale: Scale) -> Fields:
 class Measure:
     """Turns outputs of the network for frames of one sensor into `Fields`.
 
-    `background` is the picture of its untouched gel. If that has dots, shear is their motion
-    (`DotFlow`), and the force along the gel follows from it. `oriented` turns and mirrors pictures
+    `background` is the image of its untouched gel. If that has dots, shear is their motion
+    (`DotFlow`), and the force along the gel follows from it. `oriented` turns and mirrors images
     as `Preprocess` does. Faults of the first frame are logged once.
     """
 
@@ -308,7 +306,7 @@ class Measure:
 
     @property
     def width_mm(self) -> float | None:
-        """The mm that the picture's width shows, None if nobody knows it."""
+        """The mm that the image's width shows, None if nobody knows it."""
         return self.scale.width
 
     def __call__(self, out: FieldOutput, frames: Sequence[Array]) -> Fields:
@@ -361,7 +359,7 @@ def measure_of(
         metadata: those of the weights, see `scale_of`.
         sensor: its name, or the folder of a fitted one.
         background: the untouched gel RGB u8 (h, w, 3), as the camera takes it.
-        width_mm: the mm that the picture's width shows, see `scale_of`.
+        width_mm: the mm that the image's width shows, see `scale_of`.
         log: takes a sentence on each fault of the first frame.
         rotate: degrees by which frames are turned.
         flip: how they are mirrored after that.

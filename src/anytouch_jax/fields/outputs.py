@@ -8,7 +8,7 @@ from __future__ import annotations
 from anytouch_jax.batch import FieldOutput as FieldOutput
 
 STATES = 3  # hidden states of the encoder that are read
-HALF = 2  # pixels of the picture for one of the fields, along each axis
+HALF = 2  # pixels of the image for one of the fields, along each axis
 # The last layer works with numbers of order one, and these bring them to the size of a usual touch.
 LENGTH = 0.02
 STRESS = 0.02

@@ -20,7 +20,7 @@ _USUAL = {"width_mm": 20.0, "modulus_kpa": 170.0, "aspect": round(math.log(0.75)
 class Unit(NamedTuple):
     """A value with its unit, and its formula in Python by outputs of the model.
 
-    A formula uses the width that the picture shows, `width_mm`, the modulus of the gel,
+    A formula uses the width that the image shows, `width_mm`, the modulus of the gel,
     `modulus_kpa`, and functions of numpy. `deviation(x)` is DEVIATION.
     """
 
@@ -42,7 +42,7 @@ def units_of(scale: Scale) -> dict[str, Unit]:
     return {
         "depth": Unit("mm into the gel", "width_mm * depth"),
         "depth_std": Unit("mm", f"{length} * {factors['depth']} * deviation(depth_log)"),
-        "shear": Unit("mm along x and y of the picture", "width_mm * shear"),
+        "shear": Unit("mm along x and y of the image", "width_mm * shear"),
         "shear_std": Unit("mm", f"{length} * {factors['shear']} * deviation(shear_log)"),
         "contact": Unit("probability", "1 / (1 + exp(-contact))"),
         "pressure": Unit("kPa", "modulus_kpa * pressure"),

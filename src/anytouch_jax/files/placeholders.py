@@ -14,7 +14,7 @@ def placeholder(file: str | Path | bytes) -> str | None:
     """Return what takes the place of data in a file, and what to do; None for any other content.
 
     `file` is a path, or the bytes of a file. A login page and a Git LFS pointer are what downloads
-    leave most often under the name of a picture or of weights.
+    leave most often under the name of an image or of weights.
     """
     if not isinstance(file, bytes):
         with open(file, "rb") as opened:

@@ -28,7 +28,7 @@ ADDRESSES = ("http://", "https://", "rtsp://", "rtmp://", "udp://", "tcp://")
 _FORMATS = 0xC0405602
 _SIZES = 0xC02C564A
 _INTERVALS = 0xC034564B
-_CAPTURE = 1  # the type of a buffer of pictures
+_CAPTURE = 1  # the type of a buffer of images
 _DISCRETE = 1  # the type of a size or an interval that is one of a list
 _PATIENCE = 10_000  # milliseconds to wait for an address
 
@@ -120,7 +120,7 @@ def describe_cameras() -> list[str]:
 
 
 def camera_of(source: str | Path) -> int | str | None:
-    """Return the number or the address of a camera, None for a film.
+    """Return the number or the address of a camera, None for a video.
 
     `source` is a file, a number, /dev/videoN or a link to it, an address (ADDRESSES), the serial
     number of a camera, or a part of its name. A file comes first. Raises UserError for a name that
@@ -157,7 +157,7 @@ def camera_of(source: str | Path) -> int | str | None:
 def open_source(
     name: str | Path, asked: CameraSettings | None = None, log: Callable[[str], None] | None = None
 ) -> tuple[Any, bool]:
-    """Return a cv2.VideoCapture of a camera or a film, and whether it is a camera.
+    """Return a cv2.VideoCapture of a camera or a video, and whether it is a camera.
 
     Args:
         name: what a user calls it (see `camera_of`).
@@ -178,11 +178,11 @@ def open_source(
         source = _capture(name, camera)
     if not source.isOpened():
         raise UserError(_unopened(name, camera))
-    # An address may be that of a film, which has an end.
-    is_film = camera is None or (
+    # An address may be that of a video, which has an end.
+    is_video = camera is None or (
         isinstance(camera, str) and source.get(cv2.CAP_PROP_FRAME_COUNT) > 0
     )
-    if camera is None or is_film:
+    if camera is None or is_video:
         return source, False
     if isinstance(camera, int):
         # The driver's own queue would hold old frames.
@@ -194,7 +194,7 @@ def open_source(
 
 
 def _capture(name: str | Path, camera: int | str | None) -> Any:
-    """Return the cv2.VideoCapture of a film, a number or an address, which may not be open."""
+    """Return the cv2.VideoCapture of a video, a number or an address, which may not be open."""
     if camera is None:
         return open_video(name)
     if isinstance(camera, int):
@@ -221,8 +221,8 @@ def _unopened(name: str | Path, camera: int | str | None) -> str:
     return f"camera {name} cannot be opened; {advice}"
 
 
-class LoopedFilm:
-    """A film in place of a camera, again and again; late frames are lost.
+class LoopedVideo:
+    """A video in place of a camera, again and again; late frames are lost.
 
     Raises UserError for one without frames.
     """
@@ -294,7 +294,7 @@ def _given(source: Any, camera: int | str, asked: CameraSettings) -> str:
         missed.append(asked.format.upper())
     if missed:
         words += f", not {' and '.join(missed)} as asked for"
-    # Uncompressed pictures of a large size do not fit through USB at the full rate.
+    # Uncompressed images of a large size do not fit through USB at the full rate.
     modes = _modes(DEVICES / f"video{camera}") if isinstance(camera, int) else ()
     others = [
         (max(mode.rates), mode.format)

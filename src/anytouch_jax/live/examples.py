@@ -29,12 +29,12 @@ class ExampleCamera:
     """A camera that is pressed by one example after the other, again and again."""
 
     def __init__(self) -> None:
-        backgrounds = [_picture(f"{name}-{SENSOR}-background") for name in _PRESSES]
+        backgrounds = [_image(f"{name}-{SENSOR}-background") for name in _PRESSES]
         self._free = backgrounds[0]
         # The presses are of several gels. What a press changes is shown on one of them, because a
         # camera has one background.
         self._changes = [
-            _picture(f"{name}-{SENSOR}") - free
+            _image(f"{name}-{SENSOR}") - free
             for name, free in zip(_PRESSES, backgrounds, strict=True)
         ]
         noise = np.random.default_rng(0).standard_normal((8, *self._free.shape), np.float32)
@@ -54,7 +54,7 @@ class ExampleCamera:
         return True, np.ascontiguousarray(self.frame(self._count / _RATE)[..., ::-1])
 
     def frame(self, seconds: float) -> Array:
-        """Return the picture RGB u8 (h, w, 3) at a time."""
+        """Return the image RGB u8 (h, w, 3) at a time."""
         turn, at = divmod(seconds, _FREE + _HELD)
         # It rises at the end of the free time, and falls at the end of the press.
         height = np.clip(min(at - (_FREE - _RISE), _FREE + _HELD - at) / _RISE, 0.0, 1.0)
@@ -73,5 +73,5 @@ class ExampleCamera:
         pass
 
 
-def _picture(name: str) -> Array:
+def _image(name: str) -> Array:
     return decode(FOLDER / f"{name}.jpg").astype(np.float32)

@@ -1,7 +1,7 @@
 """Fresh frames of a camera: how many a second, and how old they are when they are read.
 
-A driver may give the same picture again, and a camera may be slower than it says: less light makes
-its exposure longer, and a crowded bus or a busy machine loses frames. Nobody sees that in pictures.
+A driver may give the same image again, and a camera may be slower than it says: less light makes
+its exposure longer, and a crowded bus or a busy machine loses frames. Nobody sees that in images.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def capture_age(source: Any) -> float:
     """Return the seconds since the grabbed frame of a camera was captured, NaN if unknown.
 
     V4L2 stamps buffers with the clock that starts with the machine. Another source gives another
-    number here, such as the position in a film, which is too far away to be taken for it.
+    number here, such as the position in a video, which is too far away to be taken for it.
     """
     get = getattr(source, "get", None)
     if get is None:

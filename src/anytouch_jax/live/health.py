@@ -1,7 +1,7 @@
 """Health of sensors: layout, exposure, focus, frozen frames, drift, wear, background, contact.
 
 A check reads some recordings of a unit and gives a value, a limit and what to do. The limits were
-set on real units in good order (`experiments/real/trust.py`). Pictures are compared at 160 pixels
+set on real units in good order (`experiments/real/trust.py`). Images are compared at 160 pixels
 on the long side.
 """
 
@@ -18,9 +18,9 @@ import numpy as np
 from anytouch_jax.data.background.contact import DEFAULT_THRESHOLD, THRESHOLDS, spread
 from anytouch_jax.data.background.estimate import (
     DOT_DEPTH,
-    UntouchedGel,
+    UntouchedBackground,
     has_dots,
-    scale_picture,
+    scale_image,
 )
 
 # Some of these names were defined here, and are asked for here.
@@ -29,7 +29,7 @@ from anytouch_jax.data.background.layout import (  # noqa: F401
     Check,
     UnitFrames,
     check_layout,
-    known_gels,
+    known_backgrounds,
     small_look,
 )
 from anytouch_jax.data.images import decode
@@ -40,7 +40,7 @@ from anytouch_jax.errors import UserError
 RECORDINGS = 24  # that are read of a unit
 FRAMES = 6  # that are read of a recording
 # What sensors in good order stay within. Units are those of the checks' values: fractions, grey
-# levels, or pixels of a picture of 160.
+# levels, or pixels of an image of 160.
 LIMITS = {
     "orientation": ORIENTATION,
     "exposure": 0.25,
@@ -55,21 +55,21 @@ LIMITS = {
     "background": 20.0,
     "two units": 16.0,
 }
-_SHARE = 0.25  # of recordings that look like another unit
-_ALIKE = 0.6  # distance within another unit, as a share of that between the two
+_FRACTION = 0.25  # of recordings that look like another unit
+_ALIKE = 0.6  # distance within another unit, as a fraction of that between the two
 _DOTS = 21  # pixels of the widest marker dots, at 160 pixels
 _FEWEST = 4  # recordings from which a fixed pattern is judged
 
 
 @dataclass(frozen=True, eq=False)
 class UnitHealth:
-    """The checks of a unit, and its usual picture."""
+    """The checks of a unit, and its usual image."""
 
     sensor: str
     unit: str
     rows: int
     checks: tuple[Check, ...]
-    picture: Array
+    image: Array
 
     @property
     def faults(self) -> tuple[Check, ...]:
@@ -102,9 +102,9 @@ def read_units(manifest: Manifest) -> Iterator[UnitFrames]:
             parts = np.split(ordered, np.flatnonzero(~same) + 1)
         recordings = []
         for place in spread(np.arange(len(parts)), RECORDINGS):
-            pictures = _pictures(manifest, parts[place][:FRAMES])
-            if pictures:
-                recordings.append(pictures)
+            images = _images(manifest, parts[place][:FRAMES])
+            if images:
+                recordings.append(images)
         free = _background(manifest, rows, group[split[group] == "background"])
         if not recordings and free is not None:
             recordings = [[free]]
@@ -119,16 +119,16 @@ def read_units(manifest: Manifest) -> Iterator[UnitFrames]:
             yield UnitFrames(sensor, unit, recordings, free, steps, len(rows))
 
 
-def _pictures(manifest: Manifest, rows: Array) -> list[Array]:
-    pictures = []
+def _images(manifest: Manifest, rows: Array) -> list[Array]:
+    images = []
     for row in rows.tolist():
         with suppress(UserError):
-            pictures.append(decode(manifest.file(row)))
-    return [picture for picture in pictures if picture.shape == pictures[0].shape]
+            images.append(decode(manifest.file(row)))
+    return [image for image in images if image.shape == images[0].shape]
 
 
 def _background(manifest: Manifest, rows: Array, free: Array) -> Array | None:
-    """Return the commonest background picture of `rows`, or the first of the `free` rows."""
+    """Return the commonest background image of `rows`, or the first of the `free` rows."""
     named = rows[manifest.present("background_path")[rows]]
     paths = [manifest.file(int(row), "background_path") for row in named]
     if paths:
@@ -209,21 +209,24 @@ def _focus(unit: UnitFrames) -> Check:
     """Compare details of one pixel with those of two: blur removes the first."""
     if max(unit.frames[0].shape) < 240:
         # It would be made larger, and then look blurred.
-        return Check("focus", None, "too small a picture")
-    shares = []
+        return Check("focus", None, "too small an image")
+    fractions = []
     details = []
     for frame in (recording[len(recording) // 2] for recording in unit.recordings):
-        grey = scale_picture(frame, 320).mean(2).astype(np.float32)
+        grey = scale_image(frame, 320).mean(2).astype(np.float32)
         one = cv2.GaussianBlur(grey, (0, 0), 1)
         two = cv2.GaussianBlur(grey, (0, 0), 2)
         details.append(float(np.std(one - two)))
-        shares.append(float(np.std(grey - one)) / (details[-1] + 1e-6))
-    share = float(np.median(shares))
+        fractions.append(float(np.std(grey - one)) / (details[-1] + 1e-6))
+    fraction = float(np.median(fractions))
     detail = float(np.median(details))
     if detail < LIMITS["detail"]:
         return Check("focus", None, f"too few details ({detail:.2f})")
     return Check(
-        "focus", share >= LIMITS["focus"], f"{share:.2f}", "Focus the camera, or clean its lens."
+        "focus",
+        fraction >= LIMITS["focus"],
+        f"{fraction:.2f}",
+        "Focus the camera, or clean its lens.",
     )
 
 
@@ -235,11 +238,11 @@ def _frozen(unit: UnitFrames) -> Check:
     ]
     if not pairs:
         return Check("frozen frames", None, "stills")
-    share = float(np.mean(pairs))
+    fraction = float(np.mean(pairs))
     return Check(
         "frozen frames",
-        share <= LIMITS["frozen"],
-        f"{share:.0%} repeat",
+        fraction <= LIMITS["frozen"],
+        f"{fraction:.0%} repeat",
         "Check cable, driver and buffer.",
     )
 
@@ -249,11 +252,11 @@ def _dropped(unit: UnitFrames) -> Check:
     near = unit.steps[(unit.steps > 0) & (unit.steps <= 4)]
     if not len(near):
         return Check("dropped frames", None, "stills")
-    share = float((near > 1).mean())
+    fraction = float((near > 1).mean())
     return Check(
         "dropped frames",
-        share <= LIMITS["dropped"],
-        f"{share:.1%} of steps",
+        fraction <= LIMITS["dropped"],
+        f"{fraction:.1%} of steps",
         "Lower the load or the rate.",
     )
 
@@ -265,7 +268,7 @@ def _tint(unit: UnitFrames) -> Check:
     """
     if len(unit.recordings) < _FEWEST:
         return Check("tint drift", None, "too few recordings")
-    # 4 grey levels more keep the logarithms of a dark picture from being noise.
+    # 4 grey levels more keep the logarithms of a dark image from being noise.
     colours = np.stack([np.median(middle, axis=(0, 1)) + 4 for middle in unit.middles])
     tint = np.log(colours[:, [0, 2]] / colours[:, 1:2])
     part = max(1, len(tint) // 4)
@@ -282,7 +285,7 @@ def _dead(unit: UnitFrames) -> Check:
         frame = recording[0]
         peaks.append(np.abs(frame.astype(np.int16) - cv2.medianBlur(frame, 3)).max(2))
     if len(peaks) < 3:
-        # A single picture may show a speck of dust, or an edge.
+        # A single image may show a speck of dust, or an edge.
         return Check("dead pixels", None, "0", "Mask them, or exchange the camera.")
     count = int((np.min(peaks, axis=0) > 40).sum())
     ok = count <= LIMITS["dead pixels"]
@@ -292,12 +295,12 @@ def _dead(unit: UnitFrames) -> Check:
 def _difference(unit: UnitFrames) -> tuple[Array, Array] | None:
     """Return what never moves and the background lacks, None if it cannot be told.
 
-    It is the usual picture minus the background f32 (h, w, 3) at 160 pixels, without tint, and a
+    It is the usual image minus the background f32 (h, w, 3) at 160 pixels, without tint, and a
     mask f32 (h, w) of where no dots are: dots move, and are no wear.
     """
     if unit.background is None or unit.background.shape != unit.frames[0].shape:
         return None
-    gel = scale_picture(unit.background)
+    gel = scale_image(unit.background)
     change = unit.usual.astype(np.float32) - gel
     clear = np.ones(gel.shape[:2], np.float32)
     change -= np.median(change, axis=(0, 1))
@@ -339,7 +342,7 @@ def _scratch(unit: UnitFrames) -> Check:
 
 
 def _background_fits(unit: UnitFrames) -> Check:
-    """Compare the background with the usual picture.
+    """Compare the background with the usual image.
 
     A press in one of them is a broad difference.
     """
@@ -361,10 +364,10 @@ def _contact(unit: UnitFrames) -> Check:
         return Check("contact", None, "no background")
     if len(unit.recordings) < _FEWEST:
         return Check("contact", None, "too few recordings")
-    gel = UntouchedGel(unit.background)
+    gel = UntouchedBackground(unit.background)
     limit = THRESHOLDS.get(unit.sensor, DEFAULT_THRESHOLD)
     frames = np.concatenate(unit.small)[::3]
-    moves = UntouchedGel(unit.usual)
+    moves = UntouchedBackground(unit.usual)
     touched = np.array([gel.score(frame) > limit for frame in frames])
     constant = False
     if touched.all():
@@ -387,7 +390,7 @@ def _one_unit(unit: UnitFrames, others: Sequence[UnitFrames]) -> Check:
         away = _distances(looks, small_look(other.usual))
         # They are unlike this unit, and much more like the other.
         exchanged = (own > LIMITS["two units"] / 2) & (away < 0.4 * own)
-        if exchanged.mean() >= _SHARE:
+        if exchanged.mean() >= _FRACTION:
             return Check(
                 name,
                 False,
@@ -395,7 +398,7 @@ def _one_unit(unit: UnitFrames, others: Sequence[UnitFrames]) -> Check:
                 "Sort them by unit. Left and right may be exchanged.",
             )
     far = own > LIMITS["two units"]
-    is_one = far.mean() < _SHARE
+    is_one = far.mean() < _FRACTION
     if not is_one:
         # Deep touches of a soft gel look unlike the others, and unlike each other. Those of another
         # unit look alike.
@@ -450,7 +453,7 @@ def contact_visible(features: Array, contact: Array, draws: int = 200) -> Check:
 
 
 def health_sheet(results: Sequence[UnitHealth], path: Path) -> None:
-    """Write a PNG with the usual picture of each unit, its name and its verdict."""
+    """Write a PNG with the usual image of each unit, its name and its verdict."""
     from anytouch_jax.files import atomic_write
 
     bands = [_band(unit) for unit in results]
@@ -460,7 +463,7 @@ def health_sheet(results: Sequence[UnitHealth], path: Path) -> None:
 def _band(unit: UnitHealth) -> Array:
     """Return the band of a unit on the sheet, BGR u8 (132, 720, 3)."""
     band = np.full((132, 720, 3), 255, np.uint8)
-    tile = scale_picture(unit.picture, 124)[..., ::-1]
+    tile = scale_image(unit.image, 124)[..., ::-1]
     band[4 : 4 + tile.shape[0], 4 : 4 + tile.shape[1]] = tile
     lines = [f"{unit.sensor} {unit.unit}: {unit.verdict}"]
     lines += [f"{check.name}: {check.value}" for check in unit.faults]

@@ -25,7 +25,7 @@ RETRY = 2.0  # seconds in which a missed read of a camera is tried again
 # Seconds of the same bytes, or of black, until they are reported. The noise of a sensor never
 # repeats.
 STUCK = 0.3
-BLACK = 8.0  # mean pixel below which a picture is black; untouched gels have 30 and more
+BLACK = 8.0  # mean pixel below which an image is black; untouched gels have 30 and more
 _PAUSE = 0.01  # seconds from a missed read to the next
 
 
@@ -59,7 +59,7 @@ class Frame(NamedTuple):
         read: the clock, in seconds, when it was read.
         decode: seconds of decoding.
         time: its time stamp in a video, in seconds.
-        picture: "ok", "frozen" or "black".
+        image: "ok", "frozen" or "black".
         missed: missed reads so far.
         repeated: frames so far with the bytes of the frame before.
         waited: seconds from its capture to its reading, NaN if the driver does not tell.
@@ -70,7 +70,7 @@ class Frame(NamedTuple):
     read: float
     decode: float
     time: float | None = None
-    picture: str = "ok"
+    image: str = "ok"
     missed: int = 0
     repeated: int = 0
     waited: float = float("nan")
@@ -169,11 +169,11 @@ def read_clips(
 
     Args:
         arrived: frames, one after the other.
-        preprocess: makes the network's input u8 (H, W, 3) of a picture.
+        preprocess: makes the network's input u8 (H, W, 3) of an image.
         frames: those of a clip.
         stride: frames from one of a clip to the next.
         mailbox: where clips, or the error of the reader, are left.
-        contact: 1, 0 or NaN of a picture RGB u8 (h, w, 3).
+        contact: 1, 0 or NaN of an image RGB u8 (h, w, 3).
     """
     ring: deque[np.ndarray] = deque(maxlen=(frames - 1) * stride + 1)
     missed = 0
@@ -236,7 +236,7 @@ def video_frames(source: Any) -> Iterator[Frame]:
 def camera_frames(source: Source, mailbox: Mailbox, log: Log) -> Iterator[Frame]:
     """Yield the frames of a camera until the mailbox is closed.
 
-    A read that fails, or whose picture has another shape, is missed and tried again. Raises
+    A read that fails, or whose image has another shape, is missed and tried again. Raises
     CameraError after RETRY seconds without a frame, and UserError for pixels that cannot be used.
     """
     number = 0
@@ -252,7 +252,7 @@ def camera_frames(source: Source, mailbox: Mailbox, log: Log) -> Iterator[Frame]
         if mailbox.is_closed:
             return
         if pixels is not None and shape not in (None, pixels.shape):
-            reason = f"its pictures have shape {pixels.shape}, and the first had {shape}"
+            reason = f"its images have shape {pixels.shape}, and the first had {shape}"
             pixels = None
         if pixels is None:
             missed += 1
@@ -273,14 +273,14 @@ def camera_frames(source: Source, mailbox: Mailbox, log: Log) -> Iterator[Frame]
             )
         failing = None
         shape = pixels.shape
-        picture = watch.look(number, pixels, decoded)
+        image = watch.look(number, pixels, decoded)
         rgb = to_rgb(pixels, f"frame {number}")[..., ::-1]
         yield Frame(
             number=number,
             pixels=rgb,
             read=grabbed,
             decode=decoded - grabbed,
-            picture=picture,
+            image=image,
             missed=missed,
             repeated=watch.repeated,
             waited=waited - (decoded - grabbed),
@@ -305,7 +305,7 @@ def _read_camera(source: Source) -> tuple[np.ndarray | None, float, str]:
 
 
 class _Watch:
-    """Whether the pictures of a camera are frozen, black or too few.
+    """Whether the images of a camera are frozen, black or too few.
 
     Each kind of fault is logged once.
     """
@@ -326,7 +326,7 @@ class _Watch:
             self._log(sentence)
 
     def look(self, number: int, pixels: np.ndarray, now: float) -> str:
-        """Return "black" or "frozen" if the picture has been so for STUCK seconds, else "ok"."""
+        """Return "black" or "frozen" if the image has been so for STUCK seconds, else "ok"."""
         last = self._last
         self._last = pixels.tobytes()
         self.repeated += self._last == last
@@ -338,9 +338,7 @@ class _Watch:
             if not is_so:
                 self._since.pop(kind, None)
             elif now - self._since.setdefault(kind, now) >= STUCK:
-                self.report(
-                    kind, f"the picture of the camera is {kind} at frame {number}. {advice}"
-                )
+                self.report(kind, f"the image of the camera is {kind} at frame {number}. {advice}")
                 return kind
         return "ok"
 

@@ -18,7 +18,7 @@ import cv2
 import jax
 import numpy as np
 
-from anytouch_jax.encoder.arrays import Join, Log, Pooling, check_features, warn
+from anytouch_jax.encoder.arrays import Aggregation, Log, Pooling, check_features, warn
 from anytouch_jax.encoder.base import Preprocess, precision
 from anytouch_jax.encoder.encoder import Encoder, check_frames
 from anytouch_jax.encoder.measured import Fields, Measure
@@ -66,7 +66,7 @@ class Embedded(NamedTuple):
         age: seconds from the grabbed frame to its features.
         started: start of the stream in Unix seconds.
         time: the time stamp of a video's frame in seconds, or `at` of a camera's.
-        picture: "ok", "frozen" or "black".
+        image: "ok", "frozen" or "black".
         missed: missed reads so far.
         contact: 1, 0 or NaN (unknown).
         reused: see `Reuse`.
@@ -83,7 +83,7 @@ class Embedded(NamedTuple):
     age: float
     started: float = 0.0
     time: float = 0.0
-    picture: str = "ok"
+    image: str = "ok"
     missed: int = 0
     contact: float = float("nan")
     reused: bool = False
@@ -103,12 +103,12 @@ class StreamSettings:
         frames: those of a clip, the last ones.
         stride: frames from one of a clip to the next.
         pooling: that of the features.
-        join: temporal aggregation of a long clip.
-        preprocess: makes the network's input of a picture, `Preprocess(encoder)` by default.
-        contact: decides contact of a picture RGB u8 (h, w, 3), as `ContactGate` does.
+        aggregation: temporal aggregation of a long clip.
+        preprocess: makes the network's input of an image, `Preprocess(encoder)` by default.
+        contact: decides contact of an image RGB u8 (h, w, 3), as `ContactGate` does.
         reuse: the factor of `Reuse`.
         measure: of `Encoder.measure_of`, measures fields in the same pass.
-        log: gets one sentence each about a missed read, a frozen and a black picture.
+        log: gets one sentence each about a missed read, a frozen and a black image.
     """
 
     live: bool
@@ -116,7 +116,7 @@ class StreamSettings:
     frames: int = 1
     stride: int = 1
     pooling: Pooling = "class"
-    join: Join = "mean"
+    aggregation: Aggregation = "mean"
     preprocess: Preprocess | None = None
     contact: Callable[[np.ndarray], float] | None = None
     reuse: float = 0.0
@@ -145,7 +145,7 @@ def stream(  # noqa: PLR0913  the call of version 0.2; `stream_with` takes the r
     frames: int = 1,
     stride: int = 1,
     pooling: Pooling = "class",
-    join: Join = "mean",
+    aggregation: Aggregation = "mean",
     log: Log = warn,
     contact: Callable[[np.ndarray], float] | None = None,
     reuse: float = 0.0,
@@ -158,7 +158,7 @@ def stream(  # noqa: PLR0913  the call of version 0.2; `stream_with` takes the r
         frames=frames,
         stride=stride,
         pooling=pooling,
-        join=join,
+        aggregation=aggregation,
         preprocess=preprocess,
         contact=contact,
         reuse=reuse,
@@ -230,7 +230,7 @@ def stream_with(encoder: Encoder, source: Source, settings: StreamSettings) -> G
                     age=end - last.read,
                     started=started,
                     time=at if last.time is None else last.time,
-                    picture=last.picture,
+                    image=last.image,
                     missed=last.missed,
                     contact=clip.contact,
                     reused=reused,
@@ -262,7 +262,7 @@ class _Embedder:
             settings.sensor,
             settings.frames,
             settings.pooling,
-            settings.join,
+            settings.aggregation,
             measures=settings.measure is not None,
         )
 
@@ -273,11 +273,11 @@ class _Embedder:
         if self._measure is None:
             out = self._run(there)
         else:
-            picture = self._measure.oriented(clip.last.pixels)
-            # The network sees square pictures: the head needs to know how wide they were.
-            aspect = np.log(picture.shape[0] / picture.shape[1])
+            image = self._measure.oriented(clip.last.pixels)
+            # The network sees square images: the head needs to know how wide they were.
+            aspect = np.log(image.shape[0] / image.shape[1])
             out, raw = self._run(there, np.full(1, aspect, np.float32))
-            self.fields = self._measure(raw, [picture])
+            self.fields = self._measure(raw, [image])
         self.values = check_features(np.asarray(out)[0])
         return copied
 
@@ -336,7 +336,7 @@ def compile_for_one(
     sensor: int,
     frames: int,
     pooling: Pooling = "class",
-    join: Join = "mean",
+    aggregation: Aggregation = "mean",
     *,
     measures: bool = False,
 ) -> Callable[..., Any]:
@@ -347,8 +347,8 @@ def compile_for_one(
         sensor: row of its table of sensors.
         frames: T, those of a clip.
         pooling: that of the features.
-        join: temporal aggregation of a clip that is longer than the encoder's.
-        measures: the function takes log(height / width) f32 (1,) of the picture, too, and returns
+        aggregation: temporal aggregation of a clip that is longer than the encoder's.
+        measures: the function takes log(height / width) f32 (1,) of the image, too, and returns
             the features and the raw fields.
     """
     touch = np.tile(encoder.blank, (1, frames, 1, 1, 1))
@@ -357,10 +357,15 @@ def compile_for_one(
         encoder.encode_and_measure(touch, row, np.zeros(1, np.float32), pooling)
         return lambda clip, aspect: encoder.encode_and_measure(clip, row, aspect, pooling)
     if not encoder.runs_in_jax or encoder.exported(frames, pooling) is not None:
-        call = partial(encoder.encode_touch, sensor=np.full(1, sensor), pooling=pooling, join=join)
+        call = partial(
+            encoder.encode_touch,
+            sensor=np.full(1, sensor),
+            pooling=pooling,
+            aggregation=aggregation,
+        )
         call(touch)
         return call
-    run = encoder.traceable(pooling, join)
+    run = encoder.traceable(pooling, aggregation)
     with precision(encoder.config):
         params, *given = jax.device_put((encoder.params, touch, np.full(1, sensor, "i4")))
         compiled: Any
@@ -383,8 +388,8 @@ class Result(NamedTuple):
         total: frames that have features. The arrays may have only the last ones.
         interrupted: by Ctrl-C or SIGTERM.
         missed: missed reads.
-        frozen: pictures that were frozen.
-        black: pictures that were black.
+        frozen: images that were frozen.
+        black: images that were black.
         error: a camera that delivers nothing any more.
         fields: numbers (n,) by name, as in a line of `Fields.summary`.
         repeated: frames of the camera so far with the bytes of the frame before (n,).
@@ -441,7 +446,7 @@ def collect(
     total = 0
     interrupted = False
     failure = None
-    pictures: Counter[str] = Counter()
+    images: Counter[str] = Counter()
     names = list[str]()
     summaries = list[list[float]]()
     try:
@@ -449,7 +454,7 @@ def collect(
         with contextlib.closing(embedded), handled(signal.default_int_handler, signal.SIGTERM):
             for frame in embedded:
                 total += 1
-                pictures[frame.picture] += 1
+                images[frame.image] += 1
                 if on_each is not None:
                     on_each(frame)
                     frame = frame._replace(values=np.zeros(0, np.float32))
@@ -480,8 +485,8 @@ def collect(
         started=stored[-1].started if stored else 0.0,
         time=_column(stored, "time"),
         missed=stored[-1].missed if stored else 0,
-        frozen=pictures["frozen"],
-        black=pictures["black"],
+        frozen=images["frozen"],
+        black=images["black"],
         error=failure,
         contact=_column(stored, "contact"),
         reused=_column(stored, "reused").astype(bool),
@@ -519,8 +524,8 @@ def budget(result: Result) -> list[str]:
     last = "," if result.total == count else f"; of the last {count}:"
     faults = {
         "missed reads": result.missed,
-        "frozen pictures": result.frozen,
-        "black pictures": result.black,
+        "frozen images": result.frozen,
+        "black images": result.black,
         "reused": int(result.reused.sum()),
     }
     known = "".join(f", {number} {name}" for name, number in faults.items() if number)

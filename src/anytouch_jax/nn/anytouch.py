@@ -59,15 +59,15 @@ class AnyTouch(nnx.Module):
         self.matcher = _matcher(model)
 
     def encode_touch(
-        self, clip: Array, sensor: Array, join: str = "mean", keep_ids: Array | None = None
+        self, clip: Array, sensor: Array, aggregation: str = "mean", keep_ids: Array | None = None
     ) -> Array:
         """Return touch embeddings (B, E) from the class token, see `Net.encode_touch`."""
         if keep_ids is not None:
             return self.touch.features(clip, sensor, keep_ids)
-        return self._over_segments(self.touch.features, clip, sensor, join)
+        return self._over_segments(self.touch.features, clip, sensor, aggregation)
 
     def encode_poolings(
-        self, clip: Array, sensor: Array, join: str = "mean"
+        self, clip: Array, sensor: Array, aggregation: str = "mean"
     ) -> tuple[Array, Array]:
         """Return in one pass `encode_touch`, and the mean over projected patch tokens.
 
@@ -77,7 +77,15 @@ class AnyTouch(nnx.Module):
         def both(clip: Array, sensor: Array) -> tuple[Array, Array]:
             return self._poolings(self.touch.hidden(clip, sensor))
 
-        return self._over_segments(both, clip, sensor, join)
+        return self._over_segments(both, clip, sensor, aggregation)
+
+    def encode_sight(self, clip: Array, sensor: Array, aggregation: str = "mean") -> Array:
+        """Return what the trunk gives of the last frame of each segment, see `Net.encode_sight`."""
+
+        def last(clip: Array, _: Array) -> Array:
+            return self.touch.sight(clip[:, -1])
+
+        return self._over_segments(last, clip, sensor, aggregation)
 
     def _poolings(self, hidden: Array) -> tuple[Array, Array]:
         """Return both poolings (B, E) of the last hidden states (B, 1 + S + N, D)."""
@@ -85,7 +93,11 @@ class AnyTouch(nnx.Module):
         return self.touch.embedding(hidden[:, 0]), mean
 
     def _over_segments(
-        self, features: Callable[[Array, Array], Features], clip: Array, sensor: Array, join: str
+        self,
+        features: Callable[[Array, Array], Features],
+        clip: Array,
+        sensor: Array,
+        aggregation: str,
     ) -> Features:
         """Return features of a clip of any length: those of its segments, joined."""
         if clip.shape[1] in (1, self.frames):
@@ -95,13 +107,13 @@ class AnyTouch(nnx.Module):
 
         def joined(z: Array) -> Array:
             z = z.reshape(b, s, z.shape[-1])
-            if join == "mean":
+            if aggregation == "mean":
                 return z.mean(1)
-            if join == "sum":
+            if aggregation == "sum":
                 return z.sum(1)
-            if join == "concat":
+            if aggregation == "concat":
                 return z.reshape(b, s * z.shape[2])
-            raise ValueError(f"segments are joined by mean, sum or concat, not {join!r}")
+            raise ValueError(f"segments are joined by mean, sum or concat, not {aggregation!r}")
 
         flat = parts.reshape(b * s, *parts.shape[2:])
         return jax.tree.map(joined, features(flat, jnp.repeat(sensor, s)))

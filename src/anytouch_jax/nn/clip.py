@@ -25,7 +25,7 @@ Params = dict[str, Any]
 
 
 class ImageTower(nnx.Module):
-    """ViT over [class, patches] of a photograph, with the embedding from the class token."""
+    """ViT over [class, patches] of an RGB image, with the embedding from the class token."""
 
     def __init__(self, model: ModelConfig, stack: Stack) -> None:
         self.patch = Dense(model.patch**2 * 3, stack.width, model, bias=False)

@@ -24,6 +24,7 @@ from anytouch_jax.config import ModelConfig
 from anytouch_jax.nn.anytouch import AnyTouch
 from anytouch_jax.nn.clip import merge_lora
 from anytouch_jax.ops import losses, tokens
+from anytouch_jax.renamed import keywords
 from anytouch_jax.shown import shown_short
 
 Params = dict[str, Any]
@@ -60,12 +61,13 @@ class Net:
         params = merge_lora(jax.tree.map(jnp.asarray, params), self.model.lora_alpha)
         return _with(params, *_skeleton(AnyTouch, replace(self.model, lora_rank=0)))
 
+    @keywords(join="aggregation")
     def encode_touch(
         self,
         params: Params,
         clip: Array,
         sensor: Array,
-        join: str = "mean",
+        aggregation: str = "mean",
         keep_ids: Array | None = None,
     ) -> Array:
         """Return touch embeddings (B, E) from the class token, not unit-norm.
@@ -74,19 +76,29 @@ class Net:
             params: Parameters of the network.
             clip: Normalised pixels, float (B, T, H, W, 3).
             sensor: Rows of the token table, i32 (B,).
-            join: A clip longer than `frames` is cut into segments (appendix, "Discussion on frame
-                number"). Their features are averaged ("mean"), summed ("sum") or concatenated
+            aggregation: A clip longer than `frames` is cut into segments (appendix, "Discussion on
+                frame number"). Their features are averaged ("mean"), summed ("sum") or concatenated
                 ("concat", which gives (B, segments * E)).
             keep_ids: Patches to encode (B, K), of stills and of clips of `frames` frames. None
                 encodes all.
         """
-        return self.bind(params).encode_touch(clip, sensor, join, keep_ids)
+        return self.bind(params).encode_touch(clip, sensor, aggregation, keep_ids)
 
+    @keywords(join="aggregation")
     def encode_poolings(
-        self, params: Params, clip: Array, sensor: Array, join: str = "mean"
+        self, params: Params, clip: Array, sensor: Array, aggregation: str = "mean"
     ) -> tuple[Array, Array]:
         """Return both poolings (B, E) in one pass: class token, and mean over patch tokens."""
-        return self.bind(params).encode_poolings(clip, sensor, join)
+        return self.bind(params).encode_poolings(clip, sensor, aggregation)
+
+    def encode_sight(
+        self, params: Params, clip: Array, sensor: Array, aggregation: str = "mean"
+    ) -> Array:
+        """Return values (B, model.sight) of the last frame of normalised clips, see `nn.sight`.
+
+        Those of a clip (B, T, H, W, 3) of several segments are aggregated as in `encode_touch`.
+        """
+        return self.bind(params).encode_sight(clip, sensor, aggregation)
 
     def encode_tokens(
         self, params: Params, clip: Array, sensor: Array, keep_ids: Array | None = None
@@ -137,7 +149,7 @@ class Net:
         return self.bind(params).encode_and_measure(clip, sensor, aspect)
 
     def encode_image(self, params: Params, image: Array) -> Array:
-        """Return image embeddings (V, E) of normalised photographs (V, H, W, 3); not unit-norm."""
+        """Return image embeddings (V, E) of normalised RGB images (V, H, W, 3); not unit-norm."""
         return self.bind(params).image(image)
 
     def encode_text(self, params: Params, ids: Array, mask: Array | None = None) -> Array:

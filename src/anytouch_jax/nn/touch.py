@@ -23,6 +23,7 @@ from anytouch_jax.nn.layers import (
     stored,
     table,
 )
+from anytouch_jax.nn.sight import Sight
 from anytouch_jax.ops import tokens
 
 
@@ -76,6 +77,8 @@ class TouchEncoder(nnx.Module):
         )
         self.post_norm = LayerNorm(width, model.norm_eps, model.dtype)
         self.projection = Dense(width, model.embed, model, bias=False)
+        if model.sight:
+            self.sight = Sight(model)
         self.patch_size = model.patch
         self.depth = model.touch.depth
         self.width = width

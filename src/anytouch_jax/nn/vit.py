@@ -21,8 +21,8 @@ from anytouch_jax.nn.layers import (
     LayerNorm,
     Mlp,
     gelu,
-    lean,
     product,
+    remat,
     rows_of,
     run_blocks,
     stacked_blocks,
@@ -105,7 +105,7 @@ class ScaledBlock(Block):
         self.scale1 = LayerScale(stack.width)
         self.scale2 = LayerScale(stack.width)
 
-    @lean
+    @remat
     def _after(self, x: Array, heads: Array) -> Array:
         x = x + self.scale1(self.attention.out(heads.reshape(x.shape)))
         return x + self.scale2(self.mlp(self.norm2(x)))

@@ -318,7 +318,7 @@ def laplace_loss(error: ArrayLike, log_scale: ArrayLike) -> Array:
     return jnp.abs(error) * jnp.exp(-log_scale) + log_scale
 
 
-def binary_loss(logit: ArrayLike, share: ArrayLike) -> Array:
+def binary_loss(logit: ArrayLike, fraction: ArrayLike) -> Array:
     """Return the cross-entropy between logits and shares in 0..1, element-wise."""
-    logit, share = _wide(logit, share)
-    return jnp.maximum(logit, 0) - logit * share + jnp.log1p(jnp.exp(-jnp.abs(logit)))
+    logit, fraction = _wide(logit, fraction)
+    return jnp.maximum(logit, 0) - logit * fraction + jnp.log1p(jnp.exp(-jnp.abs(logit)))

@@ -32,7 +32,7 @@ from anytouch_jax.sim.modalities import (
     training_objects,
     wordings,
 )
-from anytouch_jax.sim.preparation import augmented, field_batch, moved_gel, prepared
+from anytouch_jax.sim.preparation import augmented, field_batch, misregistered_background, prepared
 from anytouch_jax.sim.real import Pairs, Real, load_real
 from anytouch_jax.sim.sensing.own import find_sensor
 
@@ -41,12 +41,12 @@ __all__ = ["FIELDS", "SIMULATED", "SimulatedLoader", "caption_tokenizer"]
 
 SIMULATED = "simulated"  # the word of --data that stands for simulated touches
 WEIGHT = 9.0  # of simulated touches (--data.weights simulated) over all real ones
-# share of the touches of stage 1 and 2 that show an untouched gel, if fields are learned
+# fraction of the touches of stage 1 and 2 that show an untouched gel, if fields are learned
 FREE = (0.06, 0.02)
 TRIES = 8  # draws in which a partner by another unit is looked for
-FIELD_SHARE = 0.5  # of a batch's touches: those whose fields are learned
+FIELD_FRACTION = 0.5  # of a batch's touches: those whose fields are learned
 FIELDS = ("displacement", "shear", "pressure")
-MEDIAN = 0.4  # share of real touches whose background is the median, and not the stored picture
+MEDIAN = 0.4  # fraction of real touches whose background is the median, and not the stored image
 Batch = TouchBatch | Stage2Batch
 Info = dict[str, int]
 
@@ -113,7 +113,7 @@ class SimulatedLoader:
         self._key = jax.random.key(config.run.seed)
         self._pool: tuple[tuple[int, int], SimulatedTouches] | None = None
         has_clips = self._real is None or self._real.windows[CLIP] is not None
-        self._has_clips = has_clips and config.data.clip_share > 0
+        self._has_clips = has_clips and config.data.clip_fraction > 0
         self._assemble = jax.jit(
             partial(_assemble, config=config, rows=self._rows, devices=devices)
         )
@@ -148,8 +148,8 @@ class SimulatedLoader:
 
     def frames(self, step: int) -> int:
         """Return the frames of the touches of a step: 1 for stills."""
-        share = self.config.data.clip_share if self._has_clips else 0.0
-        is_clip = np.floor((step + 1) * share) > np.floor(step * share)
+        fraction = self.config.data.clip_fraction if self._has_clips else 0.0
+        is_clip = np.floor((step + 1) * fraction) > np.floor(step * fraction)
         if is_clip:
             return self.config.model.frames + self.config.reconstructs
         return 1
@@ -246,7 +246,7 @@ def _assemble(
     """
     count = len(touches.object)
     sensor = jnp.asarray(rows)[touches.sensor]
-    touches = moved_gel(jax.random.fold_in(key, 7), touches)
+    touches = misregistered_background(jax.random.fold_in(key, 7), touches)
     keys = jax.random.split(key, 6)
     takes = [
         _Touches(
@@ -256,7 +256,9 @@ def _assemble(
     ]
     fields = None
     if touches.fields is not None:
-        fields = field_batch(keys[2], touches, sensor, config, _slots(count * FIELD_SHARE, devices))
+        fields = field_batch(
+            keys[2], touches, sensor, config, _slots(count * FIELD_FRACTION, devices)
+        )
     kind = STILL if touches.clip.shape[2] == 1 else CLIP
     if config.stage == 1:
         one = takes[0]
@@ -269,7 +271,7 @@ def _assemble(
     if real is not None:
         pairs = real.pairs[kind] if real.pairs[kind] is not None else real.pairs[STILL]
         assert pairs is not None
-        at = _drawn(keys[3], pairs.share, config.data.batch_size - count)
+        at = _drawn(keys[3], pairs.fraction, config.data.batch_size - count)
         other = _partners(keys[4], pairs, at)
         first_key = jax.random.fold_in(keys[3], 1)
         first = _joined(first, _real_touches(first_key, real, pairs.rows[at], config))
@@ -292,7 +294,7 @@ def _real_batch(
     """Return the real touches that fill a batch of stage 1 with `count` simulated ones."""
     windows = real.windows[kind]
     assert windows is not None
-    at = _drawn(draw_key, windows.share, config.data.batch_size - count)
+    at = _drawn(draw_key, windows.fraction, config.data.batch_size - count)
     return _real_touches(key, real, windows.rows[at], config)
 
 
@@ -316,7 +318,7 @@ def _aligned(
     texts: Texts | None,
     devices: int,
 ) -> AlignBatch:
-    """Return touches with the photographs and captions that they have, in slots."""
+    """Return touches with the RGB images and captions that they have, in slots."""
     size = len(touch.sensor)
     # An unused slot has the row after the last one, and is dropped.
     image = jnp.zeros((0, *touch.clip.shape[2:]), jnp.uint8)
@@ -324,7 +326,7 @@ def _aligned(
     if photos is not None:
         count = len(touches.object)
         slots = min(_slots(count / 2, devices), count)
-        # touches with a photograph come first
+        # touches with an RGB image come first
         seen = jnp.argsort(touches.photo < 0, stable=True)[:slots]
         image = photos[touches.object[seen], jnp.maximum(touches.photo[seen], 0)]
         image_row = jnp.where(touches.photo[seen] >= 0, seen, size).astype(jnp.int32)
@@ -349,10 +351,12 @@ def _joined(one: _Touches, other: _Touches) -> _Touches:
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), one, other)
 
 
-def _drawn(key: Array, share: Leaf, count: int) -> Array:
+def _drawn(key: Array, fraction: Leaf, count: int) -> Array:
     """Return `count` numbers drawn by their cumulative probabilities."""
     # The last probability may be rounded to just below one.
-    return jnp.minimum(jnp.searchsorted(share, jax.random.uniform(key, (count,))), len(share) - 1)
+    return jnp.minimum(
+        jnp.searchsorted(fraction, jax.random.uniform(key, (count,))), len(fraction) - 1
+    )
 
 
 def _partners(key: Array, pairs: Pairs, at: Array) -> Array:
@@ -369,7 +373,7 @@ def _partners(key: Array, pairs: Pairs, at: Array) -> Array:
 def _real_touches(key: Array, real: Real, rows: Array, config: Config) -> _Touches:
     """Return augmented and prepared real touches of windows of rows (B, T)."""
     warp, gel, prepare = jax.random.split(key, 3)
-    # The index 1 is the median, which a user without a picture of the gel will have.
+    # The index 1 is the median, which a user without an image of the gel will have.
     which = jax.random.bernoulli(gel, MEDIAN, (len(rows),)).astype(jnp.int32)
     background = real.gel[real.gel_of[rows[:, -1]], which]
     moved = augmented(warp, jnp.concatenate([real.frame[rows], background[:, None]], 1), config)

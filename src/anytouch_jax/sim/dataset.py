@@ -1,4 +1,4 @@
-"""Simulated data sets on disk: images, fields, photographs and a manifest.
+"""Simulated data sets on disk: images, fields, RGB images and a manifest.
 
 A group's files are written first, then its table in `parts/`. When all parts exist they become
 `manifest.parquet` in one rename. A folder without it is unfinished, and the same command continues
@@ -56,7 +56,7 @@ def simulate(
     Args:
         scenes: What to simulate.
         out: Folder to write.
-        threads: That render photographs and write files.
+        threads: That render RGB images and write files.
         progress: Called with the number of finished touches and of all.
 
     Returns:
@@ -231,7 +231,7 @@ def _write_recording(
 def _write_photograph(
     scenes: Scenes, thing: objects.Object, recording: Recording, folder: Path, out: Path
 ) -> Path | None:
-    """Write the photograph of a recording that has one, and return its path below `out`."""
+    """Write the RGB image of a recording that has one, and return its path below `out`."""
     if not recording.has_photo:
         return None
     path = folder / "photo.jpg"

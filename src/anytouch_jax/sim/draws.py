@@ -18,6 +18,7 @@ import numpy.typing as npt
 from scipy.stats import gamma as gamma_distribution
 
 Leaf = npt.NDArray[Any] | jax.Array  # numpy, or jax under vmap and jit
+Scalar = float | np.integer[Any] | Leaf  # one number, known or traced
 Size = int | tuple[int, ...]
 
 
@@ -63,8 +64,8 @@ class Draws:
 
     def gamma(self, shape: float, size: int) -> jax.Array:
         """Return gamma values of this shape and scale 1, by the quantiles of the distribution."""
-        share, value = _gamma_quantiles(shape)
-        return jnp.exp(jnp.interp(self.uniform(size=size), share, value))
+        fraction, value = _gamma_quantiles(shape)
+        return jnp.exp(jnp.interp(self.uniform(size=size), fraction, value))
 
     def random(self) -> jax.Array:
         """Return a uniform value in 0..1."""

@@ -5,7 +5,7 @@ A `World` holds what is drawn once: height maps, materials and the families of s
 and `sensors`. So no touch repeats, none is stored, and a batch depends on its key alone.
 
 All camera sensors share one program: they are solved on one square grid and shown at one size, as
-`encoder.preprocess` shows a real picture. That is why the numbers of a sensor are arrays here
+`encoder.preprocess` shows a real image. That is why the numbers of a sensor are arrays here
 (`SensorFamily`): a program for each sensor would be compiled six times, and could not mix sensors
 in a batch.
 """
@@ -91,8 +91,8 @@ class World(NamedTuple):
     material: Leaf  # f32 (n, 2) modulus kPa, friction
     families: SensorFamily  # stacked over the sensors
     # f32 (sensors, MOST_BASES, 40, 40, 3) untouched gels in 0..1, black where there are fewer
-    gels: Leaf
-    places: Leaf  # f32 (n, P, 2) mm, places of each object of which there is a photograph
+    backgrounds: Leaf
+    places: Leaf  # f32 (n, P, 2) mm, places of each object of which there is an RGB image
 
 
 @dataclass(frozen=True)
@@ -102,10 +102,10 @@ class Sampling:
     frames: int = 1  # of a clip
     takes: int = 1  # sensors that feel each touch
     size: int = 112  # pixels of a side
-    coarse: float = 0.3  # share of touches at which every sensor touches as by hand
-    free: float = 0.0  # share of takes without contact
-    vision: float = 0.0  # share of touches at a photographed place
-    # share of takes by a sensor that mixes two families, with other lights and markers
+    coarse: float = 0.3  # fraction of touches at which every sensor touches as by hand
+    free: float = 0.0  # fraction of takes without contact
+    vision: float = 0.0  # fraction of touches at a photographed place
+    # fraction of takes by a sensor that mixes two families, with other lights and markers
     wild: float = 0.0
     depth: tuple[float, float] = (0.15, 1.0)  # mm
     fidelity: Fidelity = "fast"
@@ -122,8 +122,8 @@ class SimulatedTouches(NamedTuple):
     object: Leaf  # i32 (B,)
     photo: Leaf  # i32 (B,), number of the photographed place, or -1
     fields: Leaf | None  # f32 (B, M, h, w, channels) of the last frame
-    width: Leaf  # f32 (B, M) mm that the picture's width shows
-    aspect: Leaf  # f32 (B, M) logarithm of the height over the width that the picture shows
+    width: Leaf  # f32 (B, M) mm that the image's width shows
+    aspect: Leaf  # f32 (B, M) logarithm of the height over the width that the image shows
     modulus: Leaf  # f32 (B, M) kPa of the family's gel
     labels: dict[str, Leaf]  # f32 (B, M, T) each, see `recorder.ClipOutput`
 
@@ -156,7 +156,7 @@ class _Place(NamedTuple):
 def family(sensor: Sensor) -> SensorFamily:
     """Return the numbers of a camera sensor. Raises UserError for a field sensor."""
     photometry = look(sensor)
-    markers = sensor.markers or Markers(pitch=2.0, radius=0.3, share=0.0)
+    markers = sensor.markers or Markers(pitch=2.0, radius=0.3, fraction=0.0)
     # A limit of infinity could not be mixed with another one (`wild`).
     limited = photometry._replace(widest=np.minimum(photometry.widest, 1e3))
     shade = (
@@ -167,7 +167,7 @@ def family(sensor: Sensor) -> SensorFamily:
         sensor.noise,
         sensor.spread,
     )
-    lattice = (markers.pitch, markers.radius, markers.aspect, markers.share, markers.bend)
+    lattice = (markers.pitch, markers.radius, markers.aspect, markers.fraction, markers.bend)
     return SensorFamily(
         field=np.asarray(sensor.field, np.float32),
         gel=np.asarray((sensor.gel.modulus, sensor.gel.thickness), np.float32),
@@ -184,24 +184,24 @@ def untouched(sensor: Sensor) -> np.ndarray:
     They are black where there are fewer.
     """
     real = bases(sensor)[:MOST_BASES]
-    gels = np.zeros((MOST_BASES, _BASE, _BASE, 3), np.float32)
+    backgrounds = np.zeros((MOST_BASES, _BASE, _BASE, 3), np.float32)
     rows, columns = (np.rint(np.linspace(0, n - 1, _BASE)).astype(int) for n in real.shape[1:3])
     # A real gel is nowhere quite black, so `draw_unit` knows which ones are real.
-    gels[: len(real)] = np.maximum(real[:, rows][:, :, columns], 1e-3)
-    return gels
+    backgrounds[: len(real)] = np.maximum(real[:, rows][:, :, columns], 1e-3)
+    return backgrounds
 
 
 def as_sensor(numbers: SensorFamily) -> Sensor:
     """Return a `Sensor` of these numbers, which may be traced."""
     skin, contrast, vignette, halo, noise, spread = numbers.shade
-    pitch, radius, aspect, share, bend = numbers.markers
+    pitch, radius, aspect, fraction, bend = numbers.markers
     field: Any = (numbers.field[0], numbers.field[1])
     return Sensor(
         "family",
         field,
         (0, 0),
         Gel(modulus=numbers.gel[0], poisson=POISSON, thickness=numbers.gel[1]),
-        Markers(pitch, radius, aspect, share, tuple(numbers.ink), bend),
+        Markers(pitch, radius, aspect, fraction, tuple(numbers.ink), bend),
         "image",
         skin,
         contrast,
@@ -256,7 +256,7 @@ def make_world(
         relief=relief,
         material=np.array(material, np.float32),
         families=stack_trees([family(one) for one in kinds]),
-        gels=np.stack([untouched(one) for one in kinds]),
+        backgrounds=np.stack([untouched(one) for one in kinds]),
         places=spots.astype(np.float32),
     )
 
@@ -361,11 +361,11 @@ def _draw_take(
     """Return the sensor, the clip, the sensor's numbers and the pitch of one take of a touch."""
     # blotches are 1,600 values
     rng = Draws(key, 2048)
-    families = len(world.gels)
+    families = len(world.backgrounds)
     sensor = rng.integers(families)
     if gallery is not None:
         sensor = jnp.where(number == 1, gallery, sensor)
-    own_gels = sensor
+    own_backgrounds = sensor
     numbers = jax.tree.map(lambda x: x[sensor], world.families)
     if sampling.wild:
         is_wild = rng.uniform() < sampling.wild
@@ -378,7 +378,7 @@ def _draw_take(
     # A family of small spread is one device, which is not cropped or upside down.
     whole = numbers.shade[5] < 1
     numbers = numbers._replace(field=numbers.field * jnp.where(whole, 1.0, _cropped(rng)))
-    unit = draw_unit(as_sensor(numbers), rng, world.gels, own_gels)
+    unit = draw_unit(as_sensor(numbers), rng, world.backgrounds, own_backgrounds)
     down = jnp.where(whole, 1.0, rng.choice([-1.0, 1.0]))
     unit = unit._replace(mirror=unit.mirror * jnp.stack([jnp.float32(1), down]))
     hand = draw_by_hand(sampling.depth, rng, shared.gesture, shared.yaw)
@@ -417,13 +417,13 @@ def _times(gesture: Gesture, frames: int, rng: Draws) -> Array:
 
 
 def _cropped(rng: Draws) -> Array:
-    """Return the share (2,) of the field's height and width that is shown.
+    """Return the fraction (2,) of the field's height and width that is shown.
 
     A camera may cut one side.
     """
-    share = jnp.where(rng.uniform() < 0.5, rng.uniform(0.7, 1.0), 1.0)
+    fraction = jnp.where(rng.uniform() < 0.5, rng.uniform(0.7, 1.0), 1.0)
     side = jnp.where(rng.uniform() < 0.5, jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0]))
-    return side * (share - 1) + 1
+    return side * (fraction - 1) + 1
 
 
 def wild(one: SensorFamily, other: SensorFamily, rng: Draws) -> SensorFamily:
@@ -432,8 +432,8 @@ def wild(one: SensorFamily, other: SensorFamily, rng: Draws) -> SensorFamily:
     Photometry is linear in the light, so a mix of two photometries is that of a gel under a mix of
     their lights.
     """
-    share = rng.uniform()
-    mixed: SensorFamily = jax.tree.map(lambda a, b: share * a + (1 - share) * b, one, other)
+    fraction = rng.uniform()
+    mixed: SensorFamily = jax.tree.map(lambda a, b: fraction * a + (1 - fraction) * b, one, other)
     # lights that change places, or a side
     turn = jnp.asarray(_ORDERS)[rng.integers(len(_ORDERS))] * rng.choice([-1.0, 1.0])
     photometry = mixed.photometry._replace(

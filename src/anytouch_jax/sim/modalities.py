@@ -1,4 +1,4 @@
-"""Photographs and captions of the objects that are touched in training.
+"""RGB images and captions of the objects that are touched in training.
 
 They are made once, before training starts: rendering is for the CPU, and the simulator runs on the
 device.
@@ -67,7 +67,7 @@ def caption_tokenizer(config: Config, manifest: Manifest | None) -> Tokenizer:
 
 
 def photo_bank(things: Sequence[Object], places: np.ndarray, size: int) -> np.ndarray:
-    """Return photographs of places (objects, places, 2) mm on each object.
+    """Return RGB images of places (objects, places, 2) mm on each object.
 
     They are u8 (objects, places, size, size, 3).
     """
@@ -76,5 +76,5 @@ def photo_bank(things: Sequence[Object], places: np.ndarray, size: int) -> np.nd
         for thing, spots in zip(things, places, strict=True)
         for place in spots
     ]
-    pictures = endless.over_cores(partial(seeded_photograph, size=size), jobs)
-    return np.stack(pictures).reshape(*places.shape[:2], size, size, 3)
+    images = endless.over_cores(partial(seeded_photograph, size=size), jobs)
+    return np.stack(images).reshape(*places.shape[:2], size, size, 3)

@@ -19,9 +19,9 @@ from anytouch_jax.sim.contact.mechanics import KPA_MM2
 from anytouch_jax.sim.draws import Leaf
 from anytouch_jax.sim.endless import SimulatedTouches
 
-# Share of touches whose background is subtracted, by --data.background.
+# Fraction of touches whose background is subtracted, by --data.background.
 SUBTRACTED = {"keep": 0.0, "subtract": 1.0, "either": 0.7}
-# Largest deviation, in pixels, of the place of a gel since its picture: 0.2 on still recordings of
+# Largest deviation, in pixels, of the place of a gel since its image: 0.2 on still recordings of
 # a GelSight Mini.
 MOVED = 0.5
 
@@ -80,8 +80,8 @@ def prepared(
     frames = clip.astype(jnp.float32)
     gel = background[:, None].astype(jnp.float32)
     size = (len(clip), 1, 1, 1, 3)
-    share = SUBTRACTED[config.data.background]
-    subtract = jax.random.bernoulli(choice, share, (len(clip), 1, 1, 1, 1))
+    fraction = SUBTRACTED[config.data.background]
+    subtract = jax.random.bernoulli(choice, fraction, (len(clip), 1, 1, 1, 1))
     x = jnp.where(subtract, frames - gel, frames - UNTOUCHED)
     if jitter:
         gain, colour, level = jax.random.normal(light, (3, *size))
@@ -90,19 +90,21 @@ def prepared(
     return jnp.round(jnp.clip(x + UNTOUCHED, 0, 255)).astype(jnp.uint8)
 
 
-def moved_gel(key: Array, touches: SimulatedTouches, most: float = MOVED) -> SimulatedTouches:
+def misregistered_background(
+    key: Array, touches: SimulatedTouches, most: float = MOVED
+) -> SimulatedTouches:
     """Return touches whose backgrounds are shifted by fractions of a pixel.
 
     A gel gives way in its mount, so a real background is never quite in register.
     """
-    share, to = jax.random.split(key)
+    fraction, to = jax.random.split(key)
     size = touches.background.shape[:2]
-    shift = most * jax.random.uniform(share, (*size, 1)) * jax.random.normal(to, (*size, 2))
+    shift = most * jax.random.uniform(fraction, (*size, 1)) * jax.random.normal(to, (*size, 2))
 
-    def moved(picture: Leaf, by: Array) -> Array:
-        picture = picture.astype(jnp.float32)
+    def moved(image: Leaf, by: Array) -> Array:
+        image = image.astype(jnp.float32)
         return jax.image.scale_and_translate(
-            picture, picture.shape, (0, 1), jnp.ones(2), by, "linear", antialias=False
+            image, image.shape, (0, 1), jnp.ones(2), by, "linear", antialias=False
         )
 
     return touches._replace(background=jax.vmap(jax.vmap(moved))(touches.background, shift))
@@ -113,7 +115,7 @@ def field_batch(
 ) -> FieldBatch:
     """Return the first `count` touches of the last take with their fields, free of scale.
 
-    Lengths are over the width of the picture, pressure is over the gel's modulus, and forces are
+    Lengths are over the width of the image, pressure is over the gel's modulus, and forces are
     over modulus times width squared. So a gel of twice the size that is touched by an object of
     twice the size has the same fields. `sensor` (B, M) are rows of the sensor table.
     """
@@ -127,7 +129,7 @@ def field_batch(
     scale = stiff * width**2 * KPA_MM2
     force = jnp.stack([labels["force_x"], labels["force_y"], labels["force"]], -1) / scale[:, None]
     shown = fields[..., 3] / stiff[:, None, None]
-    # Force outside of the picture cannot be seen, so the normal force is the sum of what is shown:
+    # Force outside of the image cannot be seen, so the normal force is the sum of what is shown:
     # the mean pressure times the area, which is width times height.
     force = force.at[:, 2].set(jnp.mean(shown, (1, 2)) * jnp.exp(aspect))
     return FieldBatch(

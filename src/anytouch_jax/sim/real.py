@@ -25,7 +25,7 @@ class Windows(NamedTuple):
     """Stills or clips of real frames."""
 
     rows: Leaf  # i32 (W, T)
-    share: Leaf  # f32 (W,) cumulative probability
+    fraction: Leaf  # f32 (W,) cumulative probability
 
 
 class Pairs(NamedTuple):
@@ -35,7 +35,7 @@ class Pairs(NamedTuple):
     """
 
     rows: Leaf  # i32 (W, T)
-    share: Leaf  # f32 (W,) cumulative probability
+    fraction: Leaf  # f32 (W,) cumulative probability
     order: Leaf  # i32 (W,)
     low: Leaf  # i32 (W,)
     many: Leaf  # i32 (W,)
@@ -50,7 +50,7 @@ class Real(NamedTuple):
     """
 
     frame: Leaf  # u8 (N, S, S, 3)
-    # u8 (G, 2, S, S, 3): the stored picture of the untouched gel, and the median of the unit
+    # u8 (G, 2, S, S, 3): the stored image of the untouched gel, and the median of the unit
     gel: Leaf
     gel_of: Leaf  # i32 (N,)
     sensor: Leaf  # i32 (N,)
@@ -82,7 +82,7 @@ def load_real(manifest: Manifest, config: Config, log: Callable[[str], None]) ->
     place[rows] = np.arange(len(rows))
     reader = SampleReader(manifest, plain)
     frame = np.concatenate([reader.touch(row[None], None) for row in rows])
-    gels, gel_of = _real_gels(manifest, rows, frame, size)
+    backgrounds, gel_of = _real_backgrounds(manifest, rows, frame, size)
     texts = manifest.column("text").combine_chunks().dictionary_encode()
     caption = texts.indices.fill_null(-1).to_numpy(False)[rows].astype(np.int32)
     weights, _ = epoch_weights(manifest, config, rows)
@@ -95,7 +95,7 @@ def load_real(manifest: Manifest, config: Config, log: Callable[[str], None]) ->
     kinds += [None] * (2 - len(kinds))
     real = Real(
         frame=frame,
-        gel=gels,
+        gel=backgrounds,
         gel_of=gel_of,
         sensor=pools.sensor[rows].astype(np.int32),
         caption=caption,
@@ -105,12 +105,12 @@ def load_real(manifest: Manifest, config: Config, log: Callable[[str], None]) ->
     return jax.device_put(real)
 
 
-def _real_gels(
+def _real_backgrounds(
     manifest: Manifest, rows: np.ndarray, frame: np.ndarray, size: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return pictures of untouched gels u8 (G, 2, S, S, 3), and the number of each row's.
+    """Return images of untouched gels u8 (G, 2, S, S, 3), and the number of each row's.
 
-    A gel has its stored picture and the median of its unit, which is both where none is stored.
+    A gel has its stored image and the median of its unit, which is both where none is stored.
     """
     stored = manifest.codes("background_path")[rows]
     unit = manifest.codes("unit")[rows]
@@ -121,7 +121,7 @@ def _real_gels(
         np.stack([owner, stored]), axis=1, return_index=True, return_inverse=True
     )
     medians = dict[int, np.ndarray]()
-    gels = []
+    backgrounds = []
     for place in first:
         own = int(owner[place])
         if own not in medians:
@@ -129,12 +129,12 @@ def _real_gels(
             # Some 300 frames are enough for a median.
             some = frame[same[:: max(1, len(same) // 300)]]
             medians[own] = np.median(some, axis=0).astype(np.uint8)
-        picture = medians[own]
+        shown = medians[own]
         if stored[place] >= 0:
             image = read_image(manifest, int(rows[place]), "background_path")
-            picture = touch_evaluation([image], size)[0]
-        gels.append(np.stack([picture, medians[own]]))
-    return np.stack(gels), group.ravel().astype(np.int32)
+            shown = touch_evaluation([image], size)[0]
+        backgrounds.append(np.stack([shown, medians[own]]))
+    return np.stack(backgrounds), group.ravel().astype(np.int32)
 
 
 def _cumulative(weights: np.ndarray) -> np.ndarray:
@@ -156,7 +156,7 @@ def _pairs(
     count = np.searchsorted(touch[order], touch, side="right") - low
     return Pairs(
         rows=place[windows],
-        share=_cumulative(weights[last]),
+        fraction=_cumulative(weights[last]),
         order=order.astype(np.int32),
         low=low.astype(np.int32),
         many=count.astype(np.int32),

@@ -72,7 +72,7 @@ class ClipOutput(NamedTuple):
     field: Leaf | None
     # f32 (T,) each: normal force N, force_x and force_y N along the image, torque N mm about the
     # centre of pressure, depth mm of the deepest point, area mm2, x and y mm of the pressure in the
-    # image, slip (share of the contact that slides). With fidelity exact also whether the solver
+    # image, slip (fraction of the contact that slides). With fidelity exact also whether the solver
     # converged.
     labels: Mapping[str, Leaf]
 
@@ -165,7 +165,7 @@ class View(NamedTuple):
     pitch: float | Array  # mm of the solve grid
     image: tuple[int, int]  # (height, width) in pixels
     photometry: optics.Photometry | None = None  # instead of that of the sensor
-    stretched: bool = False  # as in `optics.picture_view`
+    stretched: bool = False  # as in `optics.pixel_positions`
     # (height, width) of the fields of the last frame. If it is None, all frames have fields, in the
     # size of the image.
     fields: tuple[int, int] | None = None
@@ -203,7 +203,7 @@ def simulate_clip(
     """
     if view is None:
         grid, pitch = solve_grid(sensor, size, fidelity)
-        view = View(grid, pitch, optics.picture_size(sensor, size))
+        view = View(grid, pitch, optics.image_size(sensor, size))
     contact = _touched(clip, sensor, view, fidelity, surface)
     labels = contact.labels
     if fidelity == "fast":
@@ -213,17 +213,17 @@ def simulate_clip(
         measured = _measured(contact, sensor, clip.unit.noise, view.pitch, keys[1:])
         return ClipOutput(None, None, measured, labels)
     behind = optics.backdrop(sensor, clip.unit, view.image, stretched=view.stretched)
-    picture = optics.Picture(sensor, clip.unit, view.image, view.photometry, view.stretched)
+    camera = optics.Rendering(sensor, clip.unit, view.image, view.photometry, view.stretched)
 
     def shown(dent: Array, moved: Array, key: Array, drift: Leaf) -> Array:
         skin = optics.Skin(dent, moved, view.pitch)
-        return optics.show(skin, picture, key, behind=behind, drift=drift)
+        return optics.show(skin, camera, key, behind=behind, drift=drift)
 
     image = jax.vmap(shown)(
         contact.press.displacement, contact.shear.displacement, keys[1:], clip.drift
     )
-    background = optics.show(None, picture, keys[0], behind=behind)
-    mapped = _fields(fields, contact, picture, view)
+    background = optics.show(None, camera, keys[0], behind=behind)
+    mapped = _fields(fields, contact, camera, view)
     return ClipOutput(image, background, mapped, labels)
 
 
@@ -341,7 +341,7 @@ def _depth(clip: ClipInput, relief: Array) -> Array:
 
 
 def _fields(
-    names: tuple[str, ...], contact: _Contact, picture: optics.Picture, view: View
+    names: tuple[str, ...], contact: _Contact, camera: optics.Rendering, view: View
 ) -> Array | None:
     """Return the fields `names` at the image's pixels as channels.
 
@@ -353,11 +353,11 @@ def _fields(
     sheared = contact.shear
     if view.fields:
         press, sheared = jax.tree.map(lambda x: x[-1:], (press, sheared))
-    onto_picture = partial(
-        optics.onto_picture,
+    onto_image = partial(
+        optics.onto_image,
         pitch=view.pitch,
-        sensor=picture.sensor,
-        unit=picture.unit,
+        sensor=camera.sensor,
+        unit=camera.unit,
         resolution=view.fields or view.image,
         stretched=view.stretched,
     )
@@ -365,12 +365,12 @@ def _fields(
     channels = []
     for name in names:
         if name == "displacement":
-            channels.append(onto_picture(press.displacement[..., None]))
+            channels.append(onto_image(press.displacement[..., None]))
         elif name == "pressure":
             # A spline overshoots at an edge of the maps.
-            channels.append(jnp.maximum(onto_picture(press.pressure[..., None]), 0))
+            channels.append(jnp.maximum(onto_image(press.pressure[..., None]), 0))
         else:
-            channels.append(onto_picture(sheared.displacement, vectors=True, grid=grid))
+            channels.append(onto_image(sheared.displacement, vectors=True, grid=grid))
     return jnp.concatenate(channels, -1)
 
 
@@ -457,12 +457,12 @@ def stack_trees(trees: Sequence[Tree]) -> Tree:
 
 
 class SimulatedTouch(NamedTuple):
-    """What the camera sees and the gel feels of B touches, at the picture's pixels (h, w)."""
+    """What the camera sees and the gel feels of B touches, at the image's pixels (h, w)."""
 
     image: Array  # u8 (B, h, w, 3)
     background: Leaf  # u8 (B, h, w, 3), of the untouched gel
     depth: Array  # (B, h, w) mm, the gel's displacement
-    shear: Array  # (B, h, w, 2) mm along x and y of the picture
+    shear: Array  # (B, h, w, 2) mm along x and y of the image
     pressure: Array  # (B, h, w) kPa
     force: Array  # (B, 3) N along x, y and into the gel
     torque: Array  # (B,) N mm
@@ -482,7 +482,7 @@ def simulate_touch(  # noqa: PLR0913 - one public call, whose values are all opt
 ) -> SimulatedTouch:
     """Press a surface into the gel of a sensor: what the camera sees and the gel feels.
 
-    Use it under jit. With fidelity "fast" all but the pictures can be differentiated with respect
+    Use it under jit. With fidelity "fast" all but the images can be differentiated with respect
     to pose and drag.
 
     Args:
@@ -494,7 +494,7 @@ def simulate_touch(  # noqa: PLR0913 - one public call, whose values are all opt
         sensor: A name, or a folder NAME.sensor.
         drag: (B, 3) mm, mm and rad, by which the object moves over the gel under the whole
             pressure.
-        size: Short side of the picture, pixels.
+        size: Short side of the image, pixels.
         modulus: Of the object, kPa.
         friction: Between object and gel.
         fidelity: How contact is solved (`mechanics.press`).

@@ -45,7 +45,7 @@ class Scenes(SceneOptions):
     """A simulated data set: the options of `SceneOptions`, checked.
 
     `touches` places on `objects` objects are each recorded by every sensor for `frames` frames.
-    Half of the held-out share of the remaining objects is for validation, if enough objects are
+    Half of the held-out fraction of the remaining objects is for validation, if enough objects are
     left. With fewer than 12 objects all are for training. Raises UserError for a scene that cannot
     be simulated.
     """
@@ -250,7 +250,9 @@ def draw_recording(scenes: Scenes, touch: Touch, sensor: str) -> Recording:
         gesture, yaw, offset, tilt = draw_by_hand(scenes.depth, rng, gesture, yaw)
     motion, depth = trajectory(scenes.frames, gesture)
     start = np.array([*offset, yaw])
-    has_photo, has_text = (bool(rng.random() < share) for share in (scenes.vision, scenes.text))
+    has_photo, has_text = (
+        bool(rng.random() < fraction) for fraction in (scenes.vision, scenes.text)
+    )
     seed = int(rng.integers(2**31))
     drift = draw_drift(scenes.frames, rng)
     return Recording(

@@ -245,7 +245,7 @@ class _Loop:
     waited: float = 0.0
 
     def __post_init__(self) -> None:
-        self.ballot = meshes.Ballot(self.mesh) if jax.process_count() > 1 else None
+        self.flags = meshes.FlagReduction(self.mesh) if jax.process_count() > 1 else None
         self.clock = time.perf_counter()
         self.last = LastStep()
 
@@ -269,9 +269,9 @@ class _Loop:
             for step, batch, info in feed:
                 placed = meshes.put_batch(batch, sharding)
                 state, metrics = step_fn(state, placed, seed_key, *self.progress(step))
-                if self.ballot:
+                if self.flags:
                     received = int(interrupt[0]) if interrupt else 0
-                    flags = self.ballot.cast(received, int(info.get(_SKIPPED, 0)))
+                    flags = self.flags.cast(received, int(info.get(_SKIPPED, 0)))
                     metrics = metrics | dict(zip((_SIGNAL, _SKIPPED), flags, strict=True))
                 # Those of the step before, while this one runs: reading them waits for the device,
                 # which would then have nothing to do until the next batch is there.
@@ -300,7 +300,7 @@ class _Loop:
 
     def signalled(self, interrupt: list[signal.Signals]) -> signal.Signals | None:
         """Return the signal that ends the run, the same in each of several processes."""
-        if self.ballot:
+        if self.flags:
             return self.shared_signal
         return next(iter(interrupt), None)
 
@@ -417,7 +417,7 @@ class _Loop:
         now = time.perf_counter()
         elapsed = max(now - self.clock, 1e-9)
         rate = {"samples_per_second": info["samples"] / elapsed}
-        rate |= {"wait": self.waited, "wait_share": self.waited / elapsed}
+        rate |= {"wait": self.waited, "wait_fraction": self.waited / elapsed}
         self.clock = now
         self.waited = 0.0
         self.row = self.record.write(step, {"loss": numbers["loss"]} | numbers | info | rate)

@@ -215,7 +215,7 @@ def joined(environ: Mapping[str, str] = os.environ) -> Iterator[_Process | None]
 
 def _initialize(environ: Mapping[str, str]) -> _Process:
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
-    # it would swallow SIGTERM, which `Ballot` shares
+    # it would swallow SIGTERM, which `FlagReduction` shares
     jax.config.update("jax_enable_preemption_service", False)
     kwargs: dict[str, Any] = {"coordinator_address": environ.get("JAX_COORDINATOR_ADDRESS")}
     if environ.get("JAX_PROCESS_ID"):
@@ -269,7 +269,7 @@ def _first_line(error: BaseException) -> str:
     return " ".join(str(error).split())[:200]
 
 
-class Ballot:
+class FlagReduction:
     """All-reduce of two flags at each step: the signal a process received, its skipped samples.
 
     All processes must leave the loop after the same step, or the next collective waits for ever.

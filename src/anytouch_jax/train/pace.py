@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 import jax
@@ -77,6 +77,28 @@ class Deadline(StepPace):
             jax.block_until_ready(metrics)
             self._begun = time.monotonic()
         return time.monotonic() >= self.until
+
+
+class Budget(Deadline):
+    """A run that ends at a time, after so many steps, or when it is told to, whatever is first.
+
+    The schedule follows the nearer of both ends, so that the rate is 0 when the run ends.
+    """
+
+    def __init__(self, until: float, steps: int, ended: Callable[[], bool] = lambda: False) -> None:
+        super().__init__(until)
+        self._steps = steps
+        self._ended = ended
+
+    def progress(self, done: int) -> np.float32 | None:
+        """Return the larger of the ratios of time and steps."""
+        by_time = super().progress(done)
+        return np.float32(max(float(by_time or 0), min(done / self._steps, 1.0)))
+
+    def stepped(self, done: int, metrics: Mapping[str, jax.Array]) -> bool:
+        """Return whether time or steps are over, or the run was told to end."""
+        is_late = super().stepped(done, metrics)
+        return is_late or done >= self._steps or self._ended()
 
 
 class MeasuredPace:

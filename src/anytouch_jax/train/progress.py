@@ -23,7 +23,7 @@ Log = Callable[[str], None]
 Advance = Callable[[Mapping[str, Any]], None]  # gets the line of metrics of each step
 # (first step, last step) -> a function that shows the lines while the block runs
 Display = Callable[[int, int], contextlib.AbstractContextManager[Advance]]
-_WAIT_SHARE = 0.05  # a run that waits for data longer than this share of its time reports it
+_WAIT_FRACTION = 0.05  # a run that waits for data longer than this fraction of its time reports it
 
 
 def to_stderr(sentence: str) -> None:
@@ -120,8 +120,8 @@ def summary(row: Mapping[str, Any]) -> str:
         parts.append(f"skipped {row['skipped_batches']}")
     if replaced := row.get("skipped_samples", 0):
         parts.append(f"{replaced:.0f} samples could not be read and were replaced")
-    if row.get("wait_share", 0) >= _WAIT_SHARE:
-        parts.append(f"waits for data {row['wait_share']:.0%}")
+    if row.get("wait_fraction", 0) >= _WAIT_FRACTION:
+        parts.append(f"waits for data {row['wait_fraction']:.0%}")
     return "  ".join(parts)
 
 

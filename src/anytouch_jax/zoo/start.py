@@ -12,20 +12,23 @@ from anytouch_jax.config import Config
 from anytouch_jax.errors import UserError
 from anytouch_jax.weights import convert
 from anytouch_jax.weights.tree import nest
+from anytouch_jax.zoo.efficientnet import ConvModel
 from anytouch_jax.zoo.families import FamilyModel
 from anytouch_jax.zoo.table import IMAGES
 
 
-def touch_of_photographs(
-    model: FamilyModel, source: str, config: Config, fresh: dict[str, Any]
+def touch_of_rgb_images(
+    model: FamilyModel | ConvModel, source: str, config: Config, fresh: dict[str, Any]
 ) -> tuple[dict[str, Any], list[str]]:
-    """Return a touch encoder that gives a still the tokens of a ViT of photographs, and sentences
+    """Return a touch encoder that gives a still the tokens of a ViT of RGB images, and sentences
     to log.
 
     The patch kernel is divided among the frames. Its bias goes into the resized positions, and
     layer scales into the layers before them. Raises UserError for another family, and for a network
     of another form.
     """
+    if not isinstance(model, FamilyModel):
+        raise UserError(f"{source} has convolutions, and a touch encoder starts from a transformer")
     form = model.form
     ours = config.model
     has_tokens = {"position", "class_token"} <= model.params.keys() and not form.tanh

@@ -104,7 +104,7 @@ class Family:
 
 _APACHE = "Apache-2.0"
 _NON_COMMERCIAL = "CC BY-NC 4.0: non-commercial"
-IMAGES = "photographs, no touch"
+IMAGES = "RGB images, no touch"
 TIMM_NEEDS = ("patch_embed.proj.weight", "cls_token", "pos_embed", "blocks.0.attn.qkv.weight")
 _HF_NEEDS = ("embeddings.patch_embeddings.projection.weight", "embeddings.cls_token")
 _PARTS = r"(head|head_dist|fc_norm|pooler|classifier|decoder\w*)\..*|(decoder_pos_embed|mask_token)"
@@ -129,6 +129,16 @@ _HF_VIT: dict[str, Any] = {
     "eps": 1e-12,
     "resample": "bicubic",
 }
+# A network of convolutions, which has a reader of its own (`zoo.efficientnet`).
+CONVOLUTIONAL = Family(
+    name="efficientnet",
+    title="EfficientNet-lite of ImageNet",
+    licence=_APACHE,
+    sensors=IMAGES,
+    table=(),
+    needs=("_conv_stem.weight",),
+    preparation=Preparation("either"),
+)
 FAMILIES = (
     *(
         Family(

@@ -2,11 +2,11 @@ import cv2
 import numpy as np
 import pytest
 from checked_world import columns
-from press_films import gel_frame, press_film
+from press_videos import gel_frame, press_video
 from refused import refused
 
 from anytouch_jax.data.background import contact as c
-from anytouch_jax.data.background.estimate import scale_picture
+from anytouch_jax.data.background.estimate import scale_image
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.errors import UserError
@@ -18,15 +18,15 @@ def gel(depth=0.0, seed=0, shift=0.0):
 
 @pytest.fixture
 def world(tmp_path):
-    """world(rows): a manifest of rows (name, picture, cells); "bg.png" is the untouched gel."""
+    """world(rows): a manifest of rows (name, image, cells); "bg.png" is the untouched gel."""
 
     def build(rows, **more):
         cv2.imwrite(str(tmp_path / "bg.png"), gel()[..., ::-1])
         full = []
         usual = {"sensor": "gelsight_mini", "sequence": "s", "split": "train"}
-        for i, (name, picture, cells) in enumerate(rows):
-            if picture is not None:
-                cv2.imwrite(str(tmp_path / name), picture[..., ::-1])
+        for i, (name, image, cells) in enumerate(rows):
+            if image is not None:
+                cv2.imwrite(str(tmp_path / name), image[..., ::-1])
             full.append({"path": name, "frame_index": i, **usual, **cells})
         names = {key: None for row in full for key in row}
         table = {key: [row.get(key) for row in full] for key in names}
@@ -104,19 +104,19 @@ def test_background_rows_of_a_unit_are_its_untouched_gel(world):
     assert scores.score[6] < 1
 
 
-def film(name, share, shape="ball", look="dotted", **cells):
-    """Rows of a gel pressed for a share of 20 frames for `world`, and whether each is pressed."""
-    pictures, contact = press_film(look, share, shape, 20)
+def video(name, fraction, shape="ball", look="dotted", **cells):
+    """Rows of a gel pressed for a part of 20 frames for `world`, and whether each is pressed."""
+    images, contact = press_video(look, fraction, shape, 20)
     return [
-        (f"{name}{k}.png", one, {"sequence": name, **cells}) for k, one in enumerate(pictures)
+        (f"{name}{k}.png", one, {"sequence": name, **cells}) for k, one in enumerate(images)
     ], contact.tolist()
 
 
 def test_recordings_of_a_unit_decide_for_its_undecided_ones(world):
-    first, contact = film("a", 0.5, unit="u")
-    second, more = film("b", 0.75, "pins", unit="u")
-    always, yes = film("c", 1.0, unit="u")
-    alone, _ = film("d", 1.0, unit="v")
+    first, contact = video("a", 0.5, unit="u")
+    second, more = video("b", 0.75, "pins", unit="u")
+    always, yes = video("c", 1.0, unit="u")
+    alone, _ = video("d", 1.0, unit="v")
     manifest = world([*first, *second, *always, *alone])
     scores = c.contact_scores(manifest)
     assert (scores.score[:60] > c.DEFAULT_THRESHOLD).tolist() == contact + more + yes
@@ -129,11 +129,11 @@ def test_recordings_of_a_unit_decide_for_its_undecided_ones(world):
 
 
 def test_a_recording_that_contradicts_its_unit_is_undecided(world):
-    first, contact = film("a", 0.5, unit="u")
-    second, more = film("b", 0.5, "bar", unit="u")
-    odd, _ = film("c", 0.5, look="coloured", unit="u")
+    first, contact = video("a", 0.5, unit="u")
+    second, more = video("b", 0.5, "bar", unit="u")
+    odd, _ = video("c", 0.5, look="coloured", unit="u")
     # another gel
-    odd = [(name, 255 - picture, cells) for name, picture, cells in odd]
+    odd = [(name, 255 - image, cells) for name, image, cells in odd]
     # one against one decides nothing
     for gel_frames, decided in ((first + second, 2), (first, 0)):
         assert c.contact_scores(world(gel_frames)).decided == len(gel_frames) / 20
@@ -145,9 +145,9 @@ def test_a_recording_that_contradicts_its_unit_is_undecided(world):
 
 
 def test_a_worn_gel_does_not_contradict_its_unit(world):
-    first, _ = film("a", 0.5, unit="u")
-    second, _ = film("b", 0.5, "bar", unit="u")
-    worn, _ = film("c", 0.5, "pins", unit="u")
+    first, _ = video("a", 0.5, unit="u")
+    second, _ = video("b", 0.5, "bar", unit="u")
+    worn, _ = video("c", 0.5, "pins", unit="u")
     rng = np.random.default_rng(0)
     dirt = cv2.GaussianBlur(
         rng.normal(0, 1, gel_frame("dotted", 0).shape).astype(np.float32), (0, 0), 6
@@ -157,18 +157,18 @@ def test_a_worn_gel_does_not_contradict_its_unit(world):
         marked = [
             (
                 name,
-                np.clip(picture + size * dirt / np.abs(dirt).max(), 0, 255).astype(np.uint8),
+                np.clip(image + size * dirt / np.abs(dirt).max(), 0, 255).astype(np.uint8),
                 cells,
             )
-            for name, picture, cells in worn
+            for name, image, cells in worn
         ]
         scores = c.contact_scores(world(first + second + marked))
         assert scores.decided == decided
 
 
-def test_a_picture_of_the_untouched_gel_decides_what_the_frames_cannot(world, tmp_path):
-    always, _ = film("a", 1.0, unit="u")
-    other, _ = film("b", 1.0, "bar", unit="v")
+def test_a_image_of_the_untouched_gel_decides_what_the_frames_cannot(world, tmp_path):
+    always, _ = video("a", 1.0, unit="u")
+    other, _ = video("b", 1.0, "bar", unit="v")
     manifest = world(
         [*always, *other, ("c.png", gel(), {"background_path": "bg.png", "unit": "w"})]
     )
@@ -220,22 +220,22 @@ def test_marks_keep_what_the_dataset_says_and_what_is_unknown(world):
     assert len(manifests.read(kept.files[0])) == 4
 
 
-def test_a_share_of_the_highest_score_of_the_recording_leaves_out_where_contact_is_made_and_broken(
+def test_a_fraction_of_the_highest_score_leaves_out_where_contact_is_made_and_broken(
     world,
 ):
     named = ["s", "s", "s", "t", "t", "u"]
     manifest = world([(f"{k}.png", None, {"sequence": name}) for k, name in enumerate(named)])
     scores = [10.0, 40.0, 19.0, 8.0, np.nan, 7.0]
-    marked, _ = _marked(manifest, scores, share=0.5)
+    marked, _ = _marked(manifest, scores, fraction=0.5)
     assert marked.column("label.contact").to_pylist() == [0, 1, 0, 1, None, 1]
     marked, _ = _marked(manifest, scores)
     assert marked.column("label.contact").to_pylist() == [1, 1, 1, 1, None, 1]
     refused(
-        "--share is a part of the highest score of a sequence, 0 to 1, not 60",
+        "--fraction is a part of the highest score of a sequence, 0 to 1, not 60",
         _marked,
         manifest,
         scores,
-        share=60,
+        fraction=60,
     )
 
 
@@ -280,7 +280,7 @@ def test_one_odd_file_ends_nothing(tmp_path):
         (tmp_path / "data" / f"{number}.png").write_bytes(b"\x89PNG")
     _, report = c.mark_contact(manifest, c.contact_scores(manifest))
     lines = report.lines()
-    at = lines.index("pictures that cannot be used:")
+    at = lines.index("images that cannot be used:")
     assert [line.split()[1] for line in lines[at + 1 : at + 6]] == ["3", "5", "6", "7", "8"]
     assert "6.png" in lines[at + 3] and "`anytouch data verify`" in lines[at + 6]
 
@@ -352,10 +352,10 @@ def test_pressed_frames_with_known_force_are_distinguished_from_free_ones(tmp_pa
     assert (got.precision, got.recall) == (1.0, 1.0)
     assert got.correlation > 0.85
     path = c.contact_sheet(manifest, scores, tmp_path / "out" / "contact.png", rows=1)
-    picture = decode(path)
-    assert picture.shape == (2 * (28 + c.TILE), c.TILE * c.PER_ROW, 3)
-    tile = picture[28 : 28 + c.TILE, : c.TILE]
-    shift = picture[56 + c.TILE :, : c.TILE]
+    image = decode(path)
+    assert image.shape == (2 * (28 + c.TILE), c.TILE * c.PER_ROW, 3)
+    tile = image[28 : 28 + c.TILE, : c.TILE]
+    shift = image[56 + c.TILE :, : c.TILE]
     red = tile[..., 0].astype(int) - tile[..., 1]
     green = shift[..., 1].astype(int) - shift[..., 0]
     # a red border above, a green one below
@@ -364,20 +364,20 @@ def test_pressed_frames_with_known_force_are_distinguished_from_free_ones(tmp_pa
 
 
 def test_an_estimated_gel_is_stored_and_becomes_the_background(tmp_path):
-    pictures, contact = press_film("dotted", 0.5, frames=16)
-    for number, picture in enumerate(pictures):
-        cv2.imwrite(str(tmp_path / f"{number}.png"), picture[..., ::-1])
+    images, contact = press_video("dotted", 0.5, frames=16)
+    for number, image in enumerate(images):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), image[..., ::-1])
     table = manifests.from_columns(columns(16), tmp_path / "a.csv")
     stored = c.store_backgrounds(table, c.contact_scores(table), tmp_path / "gels")
     assert len({stored.file(row, "background_path") for row in range(16)}) == 1
     free = np.mean([decode(stored.file(row)) for row in np.flatnonzero(~contact)], axis=0)
     assert (
         np.abs(
-            scale_picture(free.astype(np.uint8)).astype(int)
+            scale_image(free.astype(np.uint8)).astype(int)
             - decode(stored.file(0, "background_path"))
         ).mean()
         < 3
     )
     again = c.contact_scores(stored)
-    assert again.counts == {"given": 16} and not again.gels
+    assert again.counts == {"given": 16} and not again.backgrounds
     np.testing.assert_allclose(again.score, c.contact_scores(table).score, atol=0.5)

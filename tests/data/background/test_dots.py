@@ -14,9 +14,9 @@ RADIUS = 5
 def gel_with_dots(motion=lambda x, y: (0 * x, 0 * y), *, ink=30, dots=True, noise=0.0, press=0.0):
     """A gel u8 (240, 320, 3) whose dots have moved by `motion` pixels, under a press."""
     y, x = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(np.float32)
-    picture = np.stack([110 + 0.2 * x, 130 - 0.1 * y, 140 - 0.1 * x], -1)
+    image = np.stack([110 + 0.2 * x, 130 - 0.1 * y, 140 - 0.1 * x], -1)
     away = np.hypot(x - 170, y - 120) / 40
-    picture += (
+    image += (
         press
         * np.exp(-(away**2))[..., None]
         * np.stack([(x - 170) / 40, (y - 120) / 40, (170 - x) / 40], -1)
@@ -24,13 +24,13 @@ def gel_with_dots(motion=lambda x, y: (0 * x, 0 * y), *, ink=30, dots=True, nois
     for across in range(PITCH // 2, SHAPE[1], PITCH) if dots else ():
         for down in range(PITCH // 2, SHAPE[0], PITCH):
             dx, dy = motion(np.float32(across), np.float32(down))
-            share = np.clip(RADIUS + 0.5 - np.hypot(x - across - dx, y - down - dy), 0, 1)[
+            fraction = np.clip(RADIUS + 0.5 - np.hypot(x - across - dx, y - down - dy), 0, 1)[
                 ..., None
             ]
-            picture = picture + share * (ink - picture)
+            image = image + fraction * (ink - image)
     rng = np.random.default_rng(0)
     return np.clip(
-        cv2.GaussianBlur(picture, (0, 0), 0.7) + rng.normal(0, noise, picture.shape), 0, 255
+        cv2.GaussianBlur(image, (0, 0), 0.7) + rng.normal(0, noise, image.shape), 0, 255
     ).astype(np.uint8)
 
 

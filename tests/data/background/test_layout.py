@@ -1,10 +1,10 @@
-"""Layout of pictures: turned, mirrored and recoloured ones are found, and correct ones are not."""
+"""Layout of images: turned, mirrored and recoloured ones are found, and correct ones are not."""
 
 import numpy as np
 import pytest
 
 import anytouch_jax as at
-from anytouch_jax.data.background.layout import UnitFrames, check_layout, known_gels
+from anytouch_jax.data.background.layout import UnitFrames, check_layout, known_backgrounds
 from anytouch_jax.fields.faults import faults_of
 
 
@@ -15,9 +15,9 @@ def checked(sensor: str, gel: np.ndarray, others: list[np.ndarray], **options):
 
 @pytest.mark.parametrize("sensor", ["gelsight_mini", "digit"])
 def test_turns_may_be_allowed_and_exchanged_colours_are_still_found(sensor):
-    gels = known_gels(sensor)
-    for number, gel in enumerate(gels):
-        others = gels[:number] + gels[number + 1 :]
+    backgrounds = known_backgrounds(sensor)
+    for number, gel in enumerate(backgrounds):
+        others = backgrounds[:number] + backgrounds[number + 1 :]
         # upside down, or in a mirror: a GelSight Mini looks the same in one from left to right
         for turned in (gel[::-1, ::-1], gel[::-1]):
             found = checked(sensor, turned, others)
@@ -35,12 +35,12 @@ def test_no_example_of_the_package_is_called_faulty():
         for frame in (touch.frame, touch.background):
             assert faults_of(frame, touch.background, touch.sensor, None) == (), touch.press
     ring = next(one for one in at.example_touches() if (one.press, one.sensor) == ("ring", "digit"))
-    # its own picture is what tells that it was made so
+    # its own image is what tells that it was made so
     assert faults_of(ring.frame, None, "digit", None)
     assert faults_of(ring.frame[:, ::-1], ring.background, "digit", None)
 
 
 def test_an_unknown_family_has_no_references():
-    assert known_gels("duragel") == known_gels("new_finger") == []
+    assert known_backgrounds("duragel") == known_backgrounds("new_finger") == []
     found = checked("duragel", np.zeros((30, 40, 3), np.uint8), [])
     assert found.ok is None and found.value == "no reference of this sensor"

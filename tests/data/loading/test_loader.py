@@ -100,16 +100,16 @@ def test_the_paper_takes_turns_and_the_release_draws(make, settings):
 
     assert (
         kinds(4) == ["still", "clip"] * 2
-        and kinds(8, clip_share=0.25) == (["still"] * 3 + ["clip"]) * 2
+        and kinds(8, clip_fraction=0.25) == (["still"] * 3 + ["clip"]) * 2
     )
-    drawn = kinds(400, recipe="release", clip_share=0.25)
+    drawn = kinds(400, recipe="release", clip_fraction=0.25)
     assert 70 < drawn.count("clip") < 130
-    assert drawn != kinds(400, recipe="release", clip_share=0.25, order="alternate")
-    for share, kind in ((0.0, "still"), (1.0, "clip")):
+    assert drawn != kinds(400, recipe="release", clip_fraction=0.25, order="alternate")
+    for fraction, kind in ((0.0, "still"), (1.0, "clip")):
         for recipe in ("paper", "release"):
-            assert kinds(8, recipe=recipe, clip_share=share)[7] == kind
+            assert kinds(8, recipe=recipe, clip_fraction=fraction)[7] == kind
     # clips make no epoch longer
-    assert Loader(manifest, settings(clip_share=0.0)).steps_per_epoch == 6
+    assert Loader(manifest, settings(clip_fraction=0.0)).steps_per_epoch == 6
 
 
 def test_rows_of_the_split_and_of_known_sensors_are_drawn_and_others_are_noted(
@@ -219,7 +219,7 @@ def test_images_and_texts_sit_in_their_slots(make, settings, read_back, rich, re
     assert steps >= 5 and set(shapes) == {"still", "clip"}
 
 
-def test_pictures_lie_anywhere_in_the_batch(make, settings):
+def test_images_lie_anywhere_in_the_batch(make, settings):
     rows = [{"image_path": f"v{i}.png"} if i % 4 == 0 else {} for i in range(16)]
     loader = Loader(make(rows), settings(2, batch_size=8))
     places = [tuple(loader.batch(step).align.image_row) for step in range(12)]
@@ -408,7 +408,7 @@ def test_a_bad_partner_replaces_the_triple(make, settings, read_back, rich):
     assert skipped
 
 
-def test_batches_that_groups_or_processes_cannot_share_are_refused(make, settings, rich):
+def test_batches_that_groups_or_processes_cannot_fraction_are_refused(make, settings, rich):
     manifest = make(rich)
 
     def load(groups, head="mlp", recipe="paper", **data):
@@ -436,7 +436,7 @@ def test_batches_that_groups_or_processes_cannot_share_are_refused(make, setting
 
 
 def _parts(batch):
-    """Arrays of a batch, pictures as the colour of one pixel: the same with any OpenCV."""
+    """Arrays of a batch, images as the colour of one pixel: the same with any OpenCV."""
     if batch is None:
         return
     for name, part in batch._asdict().items():

@@ -14,7 +14,7 @@ from tests.data.manifest.test_containers import write_tar
 from tests.support.tiny_models import touch_model
 
 
-def test_64_hosts_share_a_corpus():
+def test_64_hosts_fraction_a_corpus():
     """Shards of uneven size: each host reads its own, and an epoch draws each row once."""
     rng = np.random.default_rng(0)
     shard = rng.permutation(np.repeat(np.arange(640), rng.integers(20, 40, 640)))
@@ -55,7 +55,7 @@ def test_too_few_shards_or_an_uneven_batch_is_an_error():
 
 @pytest.fixture
 def corpus(tmp_path):
-    """Eight tars of four pictures, each a recording."""
+    """Eight tars of four images, each a recording."""
     paths = [f"{shard}.tar/{2 * row}" for shard in range(8) for row in range(4)]
     for shard in range(8):
         write_tar(tmp_path / f"{shard}.tar", range(4 * shard, 4 * shard + 4))
@@ -71,7 +71,7 @@ def config(**data) -> Config:
     return replace(
         Config(touch_model()),
         data=replace(
-            Config(touch_model()).data, **(plain | {"parts": 4, "clip_share": 0.0} | data)
+            Config(touch_model()).data, **(plain | {"parts": 4, "clip_fraction": 0.0} | data)
         ),
     )
 

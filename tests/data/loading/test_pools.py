@@ -288,7 +288,7 @@ def test_the_trained_sensors_are_those_drawn_from(make, settings):
     ]
     for stage, data, sensors in (
         (1, {}, ["gelsight", "digit", "gelslim"]),
-        (1, {"clip_share": 1.0}, ["digit", "gelslim"]),
+        (1, {"clip_fraction": 1.0}, ["digit", "gelslim"]),
         (2, {"require": ("text",)}, ["digit", "gelslim"]),
     ):
         assert Loader(make(rows), settings(stage, **data)).trained_sensors == sensors

@@ -145,7 +145,7 @@ def test_only_bad_samples_end_in_an_error(make, settings):
     refused(words, Loader(manifest, settings(on_bad_sample="skip")).batch, 0)
 
 
-def test_a_bad_picture_names_its_column(make, settings):
+def test_a_bad_image_names_its_column(make, settings):
     manifest = make([{"image_path": f"v{i}.png"} for i in range(4)])
     manifest.file(1, "image_path").write_bytes(b"x" * 50)
     refused(r"row 1 of .*column 'image_path': .*v1\.png", Loader(manifest, settings(2)).batch, 0)

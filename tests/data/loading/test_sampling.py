@@ -74,13 +74,16 @@ def test_strata_fill_a_batch_and_visit_everything(sizes, batch, multiple):
         assert now[s.VISION] + now[s.BOTH] <= strata.images
         assert now[s.TEXT] + now[s.BOTH] <= strata.texts
         total += now
-    shares = np.array(sizes) * batch / sum(sizes)
+    fractions = np.array(sizes) * batch / sum(sizes)
     assert ((total > 0) == (np.array(sizes) > 0)).all()
     # nobody loses more than half
-    assert (total / steps >= shares / 2 - batch / steps).all()
-    for slots, share in ((strata.images, shares[:2].sum()), (strata.texts, shares[1:3].sum())):
-        assert share - 1e-9 <= slots <= batch
-        assert slots == batch or (slots % multiple == 0 and slots < share + multiple)
+    assert (total / steps >= fractions / 2 - batch / steps).all()
+    for slots, fraction in (
+        (strata.images, fractions[:2].sum()),
+        (strata.texts, fractions[1:3].sum()),
+    ):
+        assert fraction - 1e-9 <= slots <= batch
+        assert slots == batch or (slots % multiple == 0 and slots < fraction + multiple)
     # straight to one step
     again = s.StratumQuota(sizes, batch, multiple).at(steps - 1)
     np.testing.assert_array_equal(again[0] + again[1], total)
@@ -121,8 +124,8 @@ def test_an_epoch_draws_each_thing_by_its_weight(weights):
     many = Counter(thing for thing, _ in drawn)
     for weight in np.unique(weights):
         ids = np.flatnonzero(weights == weight)
-        share = max(1, round(weight * len(ids))) / len(ids)
-        assert all(abs(many[t] / epochs - share) < 0.15 for t in ids)
+        fraction = max(1, round(weight * len(ids))) / len(ids)
+        assert all(abs(many[t] / epochs - fraction) < 0.15 for t in ids)
     # each time with another augmentation
     assert len(set(drawn)) == len(drawn)
     # no need to walk there

@@ -22,7 +22,7 @@ def png(value: int) -> bytes:
 
 
 def write_tar(file, values) -> None:
-    """A WebDataset shard: a picture and a text for each key."""
+    """A WebDataset shard: an image and a text for each key."""
     with tarfile.open(file, "w") as archive:
         for value in values:
             for name, data in ((f"key{value}.png", png(value)), (f"key{value}.json", b"{}")):

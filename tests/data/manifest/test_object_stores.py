@@ -24,7 +24,7 @@ SHARDS = 4
 
 @pytest.fixture
 def corpus(tmp_path, monkeypatch):
-    """Tars of four pictures in a folder, and an empty cache."""
+    """Tars of four images in a folder, and an empty cache."""
     (tmp_path / "corpus" / "train").mkdir(parents=True)
     for shard in range(SHARDS):
         write_tar(tmp_path / "corpus" / "train" / f"{shard}.tar", range(4 * shard, 4 * shard + 4))

@@ -16,7 +16,7 @@ START = 5_000_000_000
 
 
 def ros_messages(store, *, ros1: bool):
-    """(topic, type, time, message): four pictures with a padded row, and a force that is late for
+    """(topic, type, time, message): four images with a padded row, and a force that is late for
     the last.
     """
     names = (
@@ -75,7 +75,7 @@ def write_ros(folder, version):
 
 
 def write_protobuf(file):
-    """Foxglove's protobuf: a topic of compressed pictures, and one of a number."""
+    """Foxglove's protobuf: a topic of compressed images, and one of a number."""
     from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
 
     stamp = descriptor_pb2.FileDescriptorProto()
@@ -264,11 +264,11 @@ def test_other_encodings_are_read_or_left_out_and_named(read, tmp_path, content,
         assert len(table.rows) == 4 and table.report.left_out == 3
         assert not (tmp_path / "run/head").exists()
     else:
-        picture = decode(tmp_path / table.report.manifest.value(4, "path"))
-        np.testing.assert_allclose(picture[4:12, 4:12].reshape(-1, 3), [expected] * 64, atol=1)
+        image = decode(tmp_path / table.report.manifest.value(4, "path"))
+        np.testing.assert_allclose(image[4:12, 4:12].reshape(-1, 3), [expected] * 64, atol=1)
 
 
-def test_one_bad_picture_or_recording_beside_good_ones_is_counted_by_place(read, tmp_path):
+def test_one_bad_image_or_recording_beside_good_ones_is_counted_by_place(read, tmp_path):
     bad = [
         (0, image(0)),
         (1 / 30, image(10) | {"data": base64.b64encode(png(10)[:40]).decode()}),
@@ -280,7 +280,7 @@ def test_one_bad_picture_or_recording_beside_good_ones_is_counted_by_place(read,
             "foxglove.CompressedImage",
             [(0, image() | {"format": "16UC1; compressedDepth png"})],
         ),
-        ("/film", "foxglove.CompressedVideo", [(0, {"format": "h264", "data": ""})]),
+        ("/video", "foxglove.CompressedVideo", [(0, {"format": "h264", "data": ""})]),
     ]
     write_topics(tmp_path / "run.mcap", [("/gel", "foxglove.CompressedImage", bad), *others])
     (tmp_path / "cut.mcap").write_bytes((tmp_path / "run.mcap").read_bytes()[:400])
@@ -291,12 +291,12 @@ def test_one_bad_picture_or_recording_beside_good_ones_is_counted_by_place(read,
     examples = {example for _, example in table.report.skipped.values()}
     assert {
         f"run.mcap, topic {topic}, frame {at}"
-        for topic, at in (("/gel", 1), ("/depth", 0), ("/film", 0))
+        for topic, at in (("/gel", 1), ("/depth", 0), ("/video", 0))
     } < examples
     assert any(str(tmp_path / "cut.mcap") in example for example in examples) and len(examples) == 4
 
 
-def test_a_recording_made_again_and_two_of_one_name_have_their_own_pictures(read, tmp_path):
+def test_a_recording_made_again_and_two_of_one_name_have_their_own_images(read, tmp_path):
     for grey, topics in ((1, ("/gel", "/g/el")), (7, ("/gel", "/g/el", "/g.el"))):
         write_topics(
             tmp_path / "run.mcap",

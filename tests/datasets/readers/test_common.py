@@ -10,7 +10,7 @@ from anytouch_jax.errors import UserError
 
 
 @pytest.mark.parametrize("bad", [{"val": -0.1}, {"val": 0.6, "test": 0.5}, {"test": 2}])
-def test_shares_are_checked(bad):
+def test_fractions_are_checked(bad):
     with pytest.raises(UserError, match="are shares"):
         IndexOptions(**bad)
 
@@ -63,14 +63,14 @@ def test_no_frame_is_opened_or_stated(tmp_path, monkeypatch):
     assert len(scans) == len(set(scans)) == 1 + 2 + 2
 
 
-def test_hash_splits_are_stable_disjoint_and_of_the_wanted_share():
+def test_hash_splits_are_stable_disjoint_and_of_the_wanted_fraction():
     options = IndexOptions(val=0.1, test=0.2)
     of = {f"o{k}": hash_split("x", f"o{k}", options) for k in range(4000)}
-    shares = {
+    fractions = {
         split: sum(one == split for one in of.values()) / len(of)
         for split in ("train", "val", "test")
     }
-    assert shares == pytest.approx({"train": 0.7, "val": 0.1, "test": 0.2}, abs=0.03)
+    assert fractions == pytest.approx({"train": 0.7, "val": 0.1, "test": 0.2}, abs=0.03)
     fixed = [
         hash_split("ycb_slide", name, IndexOptions(0.5, 0.25)) for name in ("mug", "hammer", "ball")
     ]

@@ -35,8 +35,8 @@ def write_corpus(root, source, split, rows):
 
 @pytest.fixture
 def corpus(tmp_path):
-    film = [{"capture": "ep1", "frame_idx": i, "value": i} for i in range(4)]
-    write_corpus(tmp_path, "gelslam", "train", film)
+    video = [{"capture": "ep1", "frame_idx": i, "value": i} for i in range(4)]
+    write_corpus(tmp_path, "gelslam", "train", video)
     presses = [
         {"capture": "ball", "obj_name": "sphere", "f_z": -1.5 * i, "value": 10 + i}
         for i in range(3)
@@ -63,11 +63,11 @@ def test_rows_stay_in_their_shards_with_the_licence_of_their_source(corpus):
     assert [row["path"] for row in rows[:2]] == [
         f"feats/test_unknown_indenters-00000.parquet/image/{i}" for i in (0, 1)
     ]
-    film = [row for row in rows if row["dataset"].endswith("/gelslam")]
-    assert [row["frame_index"] for row in film] == [0, 1, 2, 3] and len(
-        {row["sequence"] for row in film}
+    video = [row for row in rows if row["dataset"].endswith("/gelslam")]
+    assert [row["frame_index"] for row in video] == [0, 1, 2, 3] and len(
+        {row["sequence"] for row in video}
     ) == 1
-    assert len(report.manifest.clips(3)) == 2  # of the film alone
+    assert len(report.manifest.clips(3)) == 2  # of the video alone
     presses = rows[:3]
     assert {row["split"] for row in presses} == {"test"} and [
         row["label.force_z"] for row in presses
@@ -86,7 +86,7 @@ def test_rows_stay_in_their_shards_with_the_licence_of_their_source(corpus):
 
 
 def write_samples(file, samples):
-    """A tar with a file for each (name, data): numbers are pictures of that grey, others JSON or
+    """A tar with a file for each (name, data): numbers are images of that grey, others JSON or
     text.
     """
     file.parent.mkdir(parents=True, exist_ok=True)
@@ -100,7 +100,7 @@ def write_samples(file, samples):
 
 
 def write_tar(file, samples):
-    """A tar with a picture and JSON for each key: (grey, labels)."""
+    """A tar with an image and JSON for each key: (grey, labels)."""
     files = {
         key: (("png", value), ("json", json.dumps(labels)))
         for key, (value, labels) in samples.items()
@@ -202,7 +202,7 @@ def test_a_sample_of_webdataset_has_touches_photographs_labels_and_captions(
             assert shown == photo
     assert all(len(one) == 1 for one in splits.values())
     assert (report.left_out > 0) == bool({"mask.png", "png"} & {*fields} and len(fields) in (2, 4))
-    assert report.skipped["file of a sample that is no picture, label or text"][0] == 40
+    assert report.skipped["file of a sample that is no image, label or text"][0] == 40
 
 
 def test_fields_are_chosen_by_keys_and_shards_and_json_state_splits(tmp_path):

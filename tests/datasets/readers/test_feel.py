@@ -113,7 +113,7 @@ def test_without_a_split_file_objects_stay_whole(tmp_path, read):
     assert (
         all(len(splits) == 1 for splits in parts.values()) and len(set.union(*parts.values())) == 3
     )
-    assert table.reasons["picture of feel.csv that is not on disk"] == 1
+    assert table.reasons["image of feel.csv that is not on disk"] == 1
 
 
 @pytest.mark.parametrize("line", ["mug,1", "mug,one,1", "mug,1,2", "mug,-1,1"])
@@ -124,7 +124,7 @@ def test_a_broken_table_names_its_line(tmp_path, read, line):
     refused(r"feel.csv, line 2: expected object,number,0 or 1", read, "feel")
 
 
-def test_original_files_are_written_as_pictures(tmp_path, read):
+def test_original_files_are_written_as_images(tmp_path, read):
     grasps = {
         "i10": (50, 0, b"mug"),
         "i2": (40, 1, b"mug"),

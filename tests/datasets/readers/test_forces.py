@@ -3,9 +3,9 @@ import pickle
 
 import numpy as np
 import pytest
-from films import write_film
 from reader_world import fill
 from refused import refused
+from videos import write_video
 
 from anytouch_jax.data.images import decode
 from tests.data.manifest.test_containers import png
@@ -103,15 +103,14 @@ def test_forces_of_touchd(read, tmp_path):
         "obj22": "test",
     }
     assert (
-        table.reasons == {"picture of the table that is not on disk": 2}
-        and len(table.clips(2)) == 2
+        table.reasons == {"image of the table that is not on disk": 2} and len(table.clips(2)) == 2
     )
 
 
-def test_films_of_freetacman(read, tmp_path):
+def test_videos_of_freetacman(read, tmp_path):
     for camera in ("front", "tactile_left"):
         frames = [np.full((32, 32, 3), 40 * i, np.uint8) for i in range(5)]
-        write_film(tmp_path / f"Cast/Cast_1_{camera}.mp4", frames, 30)
+        write_video(tmp_path / f"Cast/Cast_1_{camera}.mp4", frames, 30)
     times = tmp_path / "Cast" / "Cast_1_tactile_left_timestamps.txt"
     times.write_text("".join(f"{100 + i / 30}\n" for i in range(5)))
     poses = "".join(f"{i},{0.1 * i},{40 - i},up\n" for i in range(5))
@@ -127,7 +126,7 @@ def test_films_of_freetacman(read, tmp_path):
     )
     assert (
         table["time"][4] == pytest.approx(100 + 4 / 30)
-        and "film of another camera" in table.reasons
+        and "video of another camera" in table.reasons
     )
     assert table["label.gripper_distance"] == [40, 39, 38, 37, 36]
     assert "label.note" not in table.report.manifest.table.column_names

@@ -48,7 +48,7 @@ def test_folders_that_lead_elsewhere_are_refused(tmp_path):
     fill_ycb(tmp_path / "big")
     fill(tmp_path, ["root/ssvtp/images_tac/image_0_tac.jpg", "images_rgb/image_0_rgb.jpg"])
     (tmp_path / "root" / "real").symlink_to(tmp_path / "big" / "real")
-    # of photographs
+    # of RGB images
     (tmp_path / "root" / "ssvtp" / "images_rgb").symlink_to(tmp_path / "images_rgb")
     for name, folder in (("ycb_slide", "frames"), ("ssvtp", "images_rgb")):
         refused(f"{folder} leads out of", index, name, tmp_path / "root")

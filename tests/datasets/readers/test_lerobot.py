@@ -4,8 +4,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
 import pytest
-from films import write_film
 from refused import refused
+from videos import write_video
 
 from anytouch_jax.cli.app import main
 from anytouch_jax.data.images import decode
@@ -16,18 +16,18 @@ from tests.weights.test_start import mae
 FPS = 10
 LENGTHS = (5, 4, 3)
 GEL = "observation.images.gel"
-FILM = "observation.images.tactile_film"
+VIDEO = "observation.images.tactile_film"
 SCENE = "observation.images.front"
 
 
 def make(root):
-    """Three episodes in two Parquet files and two films: a gel in Parquet, a tactile film, a camera
-    of the scene.
+    """Three episodes in two Parquet files and two videos: a gel in Parquet, a tactile video, a
+    camera of the scene.
     """
     camera = {"shape": [32, 32, 3], "names": ["height", "width", "channels"]}
     features = {
         GEL: camera | {"dtype": "image"},
-        FILM: camera | {"dtype": "video"},
+        VIDEO: camera | {"dtype": "video"},
         SCENE: camera | {"dtype": "video"},
     }
     features |= {"observation.force": {"dtype": "float32", "shape": [2], "names": None}}
@@ -52,14 +52,14 @@ def make(root):
     rows = {0: [], 1: []}
     episodes = []
     for episode, length in enumerate(LENGTHS):
-        home = episode // 2  # file of data and of film
+        home = episode // 2  # file of data and of video
         first = len(rows[home])
         place = {"chunk_index": 0, "file_index": home}
-        film = place | {"from_timestamp": first / FPS, "to_timestamp": (first + length) / FPS}
+        video = place | {"from_timestamp": first / FPS, "to_timestamp": (first + length) / FPS}
         about = {"episode_index": episode, "length": length, "stats/x": [0.5]}
         about |= {f"data/{end}": value for end, value in place.items()}
         about |= {
-            f"videos/{key}/{end}": value for key in (FILM, SCENE) for end, value in film.items()
+            f"videos/{key}/{end}": value for key in (VIDEO, SCENE) for end, value in video.items()
         }
         episodes.append(about)
         for frame in range(length):
@@ -80,8 +80,8 @@ def make(root):
     )
     for home, own in rows.items():
         frames = [np.full((32, 32, 3), 20 * row["index"], np.uint8) for row in own]
-        for key in (FILM, SCENE):
-            write_film(root / "videos" / key / "chunk-000" / f"file-{home:03d}.mp4", frames, FPS)
+        for key in (VIDEO, SCENE):
+            write_video(root / "videos" / key / "chunk-000" / f"file-{home:03d}.mp4", frames, FPS)
         table = pa.Table.from_pylist(own).replace_schema_metadata({b"huggingface": b"{}"})
         pa.parquet.write_table(table, root / "data" / "chunk-000" / f"file-{home:03d}.parquet")
     return root
@@ -97,12 +97,12 @@ def rows_of(root, **options):
     return report.manifest, report.manifest.table.to_pylist()
 
 
-def test_frames_of_parquet_and_film_have_the_indices_and_times_of_the_data_set(root):
+def test_frames_of_parquet_and_video_have_the_indices_and_times_of_the_data_set(root):
     refused("--export", rows_of, root)
     manifest, rows = rows_of(root, export=True, values=("observation.force",))
-    assert {row["unit"] for row in rows} == {GEL, FILM} and len(rows) == 24
+    assert {row["unit"] for row in rows} == {GEL, VIDEO} and len(rows) == 24
     numbers = [number for number, length in enumerate(LENGTHS) for _ in range(length)]
-    for key, factor in ((GEL, 10), (FILM, 20)):
+    for key, factor in ((GEL, 10), (VIDEO, 20)):
         own = [(at, row) for at, row in enumerate(rows) if row["unit"] == key]
         assert [row["index"] for _, row in own] == list(range(12))
         assert [row["episode"] for _, row in own] == numbers
@@ -110,7 +110,7 @@ def test_frames_of_parquet_and_film_have_the_indices_and_times_of_the_data_set(r
             [row["frame_index"] / FPS for _, row in own]
         )
         values = [int(decode(manifest.file(at)).mean()) for at, _ in own]
-        # the film is lossy
+        # the video is lossy
         np.testing.assert_allclose(values, factor * np.arange(12), atol=4)
         assert [row["label.observation.force_0"] for _, row in own] == list(range(12))
     assert rows[0]["label.task"] == "press" and len(manifest.clips(3)) == 2 * (3 + 2 + 1)
@@ -160,7 +160,7 @@ def test_a_data_set_is_embedded_and_the_features_are_a_column(root, tmp_path, ca
     ("cameras", "names"),
     [
         (["observation.left.tactile", "observation.right.tactile"], ["left", "right"]),
-        ([GEL, FILM], ["gel", "tactile_film"]),
+        ([GEL, VIDEO], ["gel", "tactile_film"]),
         (["a.left.gel", "a.left.gel.back"], ["a.left.gel", "a.left.gel.back"]),
         (["gel_left", "gel_right"], ["gel_left", "gel_right"]),
         ([GEL], [GEL]),
@@ -222,8 +222,8 @@ def test_columns_of_two_cameras_are_written_with_their_statistics_or_not_at_all(
 def test_what_is_not_a_data_set_of_this_version_is_one_sentence(root, tmp_path):
     refused(f"choose with --keys from {GEL}", rows_of, root, keys=("observation.images.none",))
     refused("no feature effort", rows_of, root, keys=(GEL,), values=("effort",))
-    film = root / "videos" / FILM / "chunk-000" / "file-001.mp4"
-    film.write_bytes(film.read_bytes()[:50])
+    video = root / "videos" / VIDEO / "chunk-000" / "file-001.mp4"
+    video.write_bytes(video.read_bytes()[:50])
     refused("download it again", rows_of, root, export=True)
     info = json.loads((root / "meta" / "info.json").read_text())
     (root / "meta" / "info.json").write_text(json.dumps(info | {"codebase_version": "v2.1"}))

@@ -18,7 +18,7 @@ def test_objectfolder_has_two_sensors_and_published_splits(tmp_path, read):
     assert (row["label.material"], row["split"], row["dataset"]) == (2, "train", "objectfolder2")
     assert table.rows["obj2.0/touch/1000/1.png"]["label.material"] is None
     assert table.reasons["id that does not belong to obj2.0/touch (1.0 ends at 100)"] == 1
-    assert table.reasons["picture of split.json that is not on disk"] == 1
+    assert table.reasons["image of split.json that is not on disk"] == 1
     (tmp_path / "obj2.0/split.json").write_text(
         json.dumps({"train": [["1", 0]], "test": [["1", 0]]})
     )

@@ -29,7 +29,7 @@ def test_real_touch_is_checked_and_rewritten(tmp_path, read):
     refused("repeats frame_index 0", read, "real_touch")
 
 
-def test_taxim_presses_become_pictures(tmp_path, read):
+def test_taxim_presses_become_images(tmp_path, read):
     calib = tmp_path / "calib"
     images = np.zeros((5, 6, 8, 3), np.uint8)
     # blue: the pack is BGR

@@ -3,9 +3,9 @@ import os
 import cv2
 import numpy as np
 import pytest
-from films import write_film
 from reader_world import fill
 from refused import refused
+from videos import write_video
 
 from anytouch_jax.data.images import decode
 from anytouch_jax.datasets.readers import IndexOptions
@@ -13,7 +13,7 @@ from anytouch_jax.datasets.readers.recordings import ranked_split
 from anytouch_jax.errors import UserError
 
 
-def test_a_folder_of_pictures_is_a_recording_of_the_first_folders_object(tmp_path, read):
+def test_a_folder_of_images_is_a_recording_of_the_first_folders_object(tmp_path, read):
     fill(tmp_path, [f"mug/{take}/{n}.png" for take in ("one", "two") for n in range(12)])
     fill(tmp_path, [f"ball/{n}.jpg" for n in (3, 4, 6)])
     table = read("recordings", sensor="digit", val=0, test=0)
@@ -37,7 +37,7 @@ def test_files_in_or_above_the_folder_belong_to_a_recording(tmp_path, read):
     )
     fill(tmp_path, ["mug/two/Background.png", "ball/0.png"])
     (tmp_path / "mug" / "caption.txt").write_text("smooth,\n cold\n", encoding="utf-8")
-    (tmp_path / "mug" / "one" / "film.mp4").write_bytes(b"")
+    (tmp_path / "mug" / "one" / "video.mp4").write_bytes(b"")
     table = read("recordings", sensor="digit", val=0, test=0)
     one, two, ball = (table.rows[path] for path in ("mug/one/1.png", "mug/two/0.png", "ball/0.png"))
     assert len(table.rows) == 4
@@ -48,10 +48,10 @@ def test_files_in_or_above_the_folder_belong_to_a_recording(tmp_path, read):
     assert named[0] == ["background.png", "mug/photo.jpg", "smooth, cold"]
     assert named[1][:2] == ["mug/two/Background.png", "mug/photo.jpg"]
     assert named[2] == ["background.png", None, None]
-    assert table.reasons == {"video (--export writes its frames as pictures)": 1}
+    assert table.reasons == {"video (--export writes its frames as images)": 1}
 
 
-def test_pictures_in_the_folder_itself_are_one_recording(tmp_path, read):
+def test_images_in_the_folder_itself_are_one_recording(tmp_path, read):
     fill(tmp_path / "mine", ["0.png", "1.png"])
     table = read("recordings", tmp_path / "mine", sensor="digit", val=0, test=0)
     assert list(table.rows) == ["0.png", "1.png"] and set(table["sequence"]) == {"."}
@@ -69,7 +69,7 @@ def test_few_objects_fill_every_split_whatever_their_folder_is_called(tmp_path, 
     assert any("--split-by recording" in note for note in table.report.notes)
 
 
-def test_ranked_splits_have_their_shares_and_hardly_move():
+def test_ranked_splits_have_their_fractions_and_hardly_move():
     names = [f"o{n}" for n in range(40)]
     before = ranked_split(names, IndexOptions(0.2, 0.3))
     assert [list(before.values()).count(split) for split in ("val", "train", "test")] == [8, 20, 12]
@@ -178,10 +178,10 @@ def test_two_fingers_in_one_folder_are_two_sequences(tmp_path, read):
     assert all(len({path[:10] for path in clip}) == 1 for clip in table.clips(3))
 
 
-def test_videos_become_folders_of_pictures(tmp_path, read):
+def test_videos_become_folders_of_images(tmp_path, read):
     root = tmp_path / "mine"
     for name in ("one", "two"):
-        write_film(
+        write_video(
             root / "mug" / f"{name}.avi",
             [np.full((32, 32, 3), (200, 20 * n, 10), np.uint8) for n in range(5)],
         )
@@ -189,7 +189,7 @@ def test_videos_become_folders_of_pictures(tmp_path, read):
     fill(root, ["ball/0.png"])
     table = read("recordings", root, sensor="digit", val=0, test=0)
     assert len(table.rows) == 1 and table.reasons == {
-        "video (--export writes its frames as pictures)": 3
+        "video (--export writes its frames as images)": 3
     }
     table = read("recordings", root, sensor="digit", val=0, test=0, export=True)
     assert len(table.clips(5)) == 2 and table.reasons["video that cannot be read"] == 1
@@ -224,7 +224,7 @@ def test_split_words_decide_splits_and_name_nothing(tmp_path, read, form, splits
             for n in range(count)
         ],
     )
-    table = read("recordings", sensor="digit", films=True)
+    table = read("recordings", sensor="digit", videos=True)
     of = dict(zip(splits, parts, strict=True))
     for path, row in table.rows.items():
         assert row["object"] in kinds and row["object"] in path and row["object"] in row["sequence"]
@@ -247,36 +247,36 @@ def test_a_path_in_two_splits_is_refused_and_folders_outside_are_ranked(tmp_path
     refused("train/a/valid names two splits, train and valid", read, "recordings", sensor="digit")
 
 
-def _presses(folder, names, seconds=0.0, film=False):
-    """Write pictures of presses at random places, or of one that moves on, and the times of their
+def _presses(folder, names, seconds=0.0, video=False):
+    """Write images of presses at random places, or of one that moves on, and the times of their
     files.
     """
     rng = np.random.default_rng(list(folder.name.encode()))
     folder.mkdir(parents=True, exist_ok=True)
     for at, name in enumerate(names):
-        picture = np.full((48, 64, 3), 90, np.uint8)
-        place = (8 + 4 * at, 24) if film else tuple(int(x) for x in rng.integers(8, 40, 2))
-        cv2.imwrite(str(folder / name), cv2.circle(picture, place, 8, (220, 160, 90), -1))
+        image = np.full((48, 64, 3), 90, np.uint8)
+        place = (8 + 4 * at, 24) if video else tuple(int(x) for x in rng.integers(8, 40, 2))
+        cv2.imwrite(str(folder / name), cv2.circle(image, place, 8, (220, 160, 90), -1))
         os.utime(folder / name, (1.7e9 + seconds * at,) * 2)
 
 
 @pytest.mark.parametrize(
     ("names", "single", "made"),
     [
-        ([f"{n:03d}.png" for n in range(9)], False, {"film": True}),
-        ([f"{n:03d}.png" for n in range(9)], True, {}),  # numbered too: the pictures decide
+        ([f"{n:03d}.png" for n in range(9)], False, {"video": True}),
+        ([f"{n:03d}.png" for n in range(9)], True, {}),  # numbered too: the images decide
         (
             [f"{n:03d}.png" for n in range(9)],
             True,
-            {"film": True, "seconds": 60},
+            {"video": True, "seconds": 60},
         ),  # or the times of the files
-        ([f"1731000000.{33 * n:03d}.png" for n in range(9)], False, {"film": True}),
-        ([f"IMG_20240105_12{n:02d}{n * n % 60:02d}.png" for n in range(9)], True, {"film": True}),
-        ([f"17310000{n}7.png" for n in range(9)], True, {"film": True}),  # seconds
-        ([f"{n * 7919 % 4096:x}f{n * n * 31 % 17}a.png" for n in range(9)], True, {"film": True}),
+        ([f"1731000000.{33 * n:03d}.png" for n in range(9)], False, {"video": True}),
+        ([f"IMG_20240105_12{n:02d}{n * n % 60:02d}.png" for n in range(9)], True, {"video": True}),
+        ([f"17310000{n}7.png" for n in range(9)], True, {"video": True}),  # seconds
+        ([f"{n * 7919 % 4096:x}f{n * n * 31 % 17}a.png" for n in range(9)], True, {"video": True}),
     ],
 )
-def test_pictures_that_look_like_no_film_are_single_touches(tmp_path, read, names, single, made):
+def test_images_that_look_like_no_video_are_single_touches(tmp_path, read, names, single, made):
     for kind in ("nut", "pin", "cap"):
         _presses(tmp_path / kind, names, **made)
     table = read("recordings", sensor="digit")
@@ -285,7 +285,7 @@ def test_pictures_that_look_like_no_film_are_single_touches(tmp_path, read, name
         3 if single else 1
     )
     assert ("<touch>" in table.report.notes[0]) == single
-    for choice, count in (("singles", 27), ("films", 3)):
+    for choice, count in (("singles", 27), ("videos", 3)):
         assert len(set(read("recordings", sensor="digit", **{choice: True})["sequence"])) == count
 
 
@@ -318,13 +318,13 @@ def test_single_touches_are_split_by_a_group_of_the_user(tmp_path, read):
         ("(x)", "is in no path"),
     ):
         refused(words, read, "recordings", sensor="digit", split_by=wrong)
-    refused("exclude each other", read, "recordings", sensor="digit", singles=True, films=True)
+    refused("exclude each other", read, "recordings", sensor="digit", singles=True, videos=True)
 
 
 def test_frames_without_order_in_their_names_come_by_time_when_asked(tmp_path, read):
     names = [f"{word}.png" for word in ("one", "two", "three", "four")]
     _presses(tmp_path / "mug", names, seconds=1)
-    table = read("recordings", sensor="digit", films=True)
+    table = read("recordings", sensor="digit", videos=True)
     assert any(
         "names do not order 1 recordings clearly (first: mug); --order times" in x
         for x in table.report.notes
@@ -342,7 +342,7 @@ def test_mistakes(tmp_path, read):
     (tmp_path / "a" / "caption.txt").write_bytes(b"\xff\xfe\x00")
     refused(r"caption\.txt cannot be read as UTF-8 text", read, "recordings", sensor="digit")
     (tmp_path / "empty").mkdir()
-    (tmp_path / "empty" / "film.mp4").write_bytes(b"")
+    (tmp_path / "empty" / "video.mp4").write_bytes(b"")
     with pytest.raises(UserError, match=r"no frame of recordings .*--export writes its frames"):
         read("recordings", tmp_path / "empty", sensor="digit")
 
@@ -359,7 +359,7 @@ def test_arrays_count_where_there_is_nothing_else(tmp_path, read):
         "a/4.png": 4,
         "b/0.npy": 0,
     }
-    assert table.reasons == {"array next to pictures": 2}
+    assert table.reasons == {"array next to images": 2}
 
 
 def test_what_is_no_recording(tmp_path, read):
@@ -370,5 +370,5 @@ def test_what_is_no_recording(tmp_path, read):
         "mug/1700000000.1234567.png",
         "mug/1700000000.5.png",
     ]
-    assert table.reasons == {"folder called background or photo, where one picture is expected": 1}
+    assert table.reasons == {"folder called background or photo, where one image is expected": 1}
     assert set(table["sequence"]) == {".", "mug", tmp_path.name}

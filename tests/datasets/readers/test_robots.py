@@ -56,7 +56,7 @@ def test_visgel_contact_list_and_missing_files(tmp_path, read):
     # frame 0 is not there
     assert table.rows["images/touch/a/rec_1/frame0001.jpg"]["background_path"] is None
     assert table.reasons["listed contact frame that is not on disk"] == 1
-    assert table.reasons["photograph missing (kept without)"] == 1
+    assert table.reasons["RGB image missing (kept without)"] == 1
 
 
 def test_visgel_unseen_objects_are_test(tmp_path, read):

@@ -25,7 +25,7 @@ def test_contact_windows_pairs_photographs_and_captions(tmp_path, read):
     assert table.report.splits == {"train": 2 * (4 + 8 + 5), "background": 2 * (6 + 2 + 5)}
     row = table.rows["data_indoor/tea towel/gelsight/6.png"]
     assert (row["split"], row["label.contact"], row["touch"]) == ("train", 1, "indoor/tea towel")
-    # 6 / 10 of 5 photographs
+    # 6 / 10 of 5 RGB images
     assert row["image_path"] == "data_indoor/tea towel/img_gelsight/3.png"
     assert row["background_path"] == "data_indoor/tea towel/gelsight/0.png"
     assert row["caption_id"] == "tacquad_indoor_1"
@@ -83,7 +83,7 @@ def test_missing_items_frames_photographs_and_tac3d_are_counted(tmp_path, read):
     assert reasons["item that is not in contact_indoor.csv"] == 1
     assert reasons["folder 'tac3d' (no sensor with images)"] == 1
     assert reasons["contact frame that is not on disk"] == 1
-    assert reasons["photograph missing (kept without)"] >= 1
+    assert reasons["RGB image missing (kept without)"] >= 1
 
 
 def test_the_wrong_name_in_the_list_is_mended_and_noted(tmp_path, read):

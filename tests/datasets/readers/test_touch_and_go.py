@@ -96,7 +96,7 @@ def test_what_is_missing_is_counted(tmp_path, read):
     reasons = read("touch_and_go").reasons
     assert reasons["listed frame that is not on disk"] == 1
     assert reasons["listed frame whose video is not on disk"] == 1
-    assert reasons["photograph missing (kept without)"] == 1
+    assert reasons["RGB image missing (kept without)"] == 1
     assert reasons["file that is not a frame by its name"] == 1
     assert reasons["video that is not unpacked (run the dataset's extract_frame.py)"] == 1
 

@@ -10,7 +10,7 @@ from anytouch_jax.errors import UserError
 REC = "0-1702507215.615537"
 
 
-def _picture(path, shape, kind, seed=0):
+def _image(path, shape, kind, seed=0):
     rng = np.random.default_rng(seed)
     ramp = np.linspace(0, 200, shape[1] if kind == "touch" else shape[0])
     image = np.broadcast_to(
@@ -104,8 +104,8 @@ def _swappable(root, swap, shapes):
     for k in range(5):
         touch, vision = ("vision", "tactile") if k in swap else ("tactile", "vision")
         for file in _names(2):
-            _picture(root / f"hct/data2/rec{k}/{touch}/{file}", shapes[0], "touch", k)
-            _picture(root / f"hct/data2/rec{k}/{vision}/{file}", shapes[1], "vision", k)
+            _image(root / f"hct/data2/rec{k}/{touch}/{file}", shapes[0], "touch", k)
+            _image(root / f"hct/data2/rec{k}/{vision}/{file}", shapes[1], "vision", k)
 
 
 @pytest.mark.parametrize(
@@ -134,7 +134,7 @@ def test_touch_is_what_is_alike_however_many_recordings_are_swapped(tmp_path, re
     for k in range(5):
         scene = np.random.default_rng(k % scenes + 1).integers(0, 256, (8, 8, 3), np.uint8)
         touch, vision = ("vision", "tactile") if k in swap else ("tactile", "vision")
-        _picture(tmp_path / f"hct/data2/rec{k}/{touch}/{_names()[0]}", (64, 64), "touch", k)
+        _image(tmp_path / f"hct/data2/rec{k}/{touch}/{_names()[0]}", (64, 64), "touch", k)
         (tmp_path / f"hct/data2/rec{k}/{vision}").mkdir()
         assert cv2.imwrite(
             f"{tmp_path}/hct/data2/rec{k}/{vision}/{_names()[0]}", cv2.resize(scene, (64, 64))
@@ -182,5 +182,5 @@ def test_ssvtp_stills(tmp_path, read):
     assert row["image_path"] == "ssvtp/images_rgb/image_2_rgb.jpg"
     assert table.rows["ssvtp/images_tac/image_10_tac.jpg"]["split"] == "test"
     assert table.rows["ssvtp/images_tac/image_7_tac.jpg"]["image_path"] is None
-    assert table.reasons["photograph without touch"] == 1
+    assert table.reasons["RGB image without touch"] == 1
     assert not table.clips(2)

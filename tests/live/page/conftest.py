@@ -1,4 +1,4 @@
-"""Touches of two sensors on disk, their features, and a film."""
+"""Touches of two sensors on disk, their features, and a video."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from films import write_film
-from gel_pictures import press
+from gel_images import press
+from videos import write_video
 from view_world import DEPTHS, SCRIPT
 
 from anytouch_jax.data.manifest import manifest as manifests
@@ -86,7 +86,7 @@ def features(touches) -> Path:
 
 
 @pytest.fixture(scope="session")
-def film(tmp_path_factory) -> Path:
-    """A film of 12 frames at 30 frames/s that grow brighter."""
+def video(tmp_path_factory) -> Path:
+    """A video of 12 frames at 30 frames/s that grow brighter."""
     frames = [np.full((48, 48, 3), 20 + 15 * frame, np.uint8) for frame in range(12)]
-    return write_film(tmp_path_factory.mktemp("film") / "press.avi", frames, 30)
+    return write_video(tmp_path_factory.mktemp("video") / "press.avi", frames, 30)

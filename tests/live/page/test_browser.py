@@ -29,6 +29,8 @@ from anytouch_jax.live.page.live import Live
 CHROMIUM = shutil.which("chromium")
 AXE = Path(sys.prefix) / "node_modules" / "axe-core" / "axe.min.js"
 SIGNS = "of 2 touches", "Click a point", "Teach it a touch", "What do you want"  # of each tab
+# a surface is turned by keys
+SURFACE = ".stage canvas[tabindex='0']"
 FRAMES = "Number(document.getElementById('main').dataset.frames)"
 pytestmark = pytest.mark.skipif(
     CHROMIUM is None, reason="there is no Chromium: apt-get install chromium"
@@ -75,7 +77,7 @@ def camera() -> PressCamera:
 
 @pytest.fixture(scope="module")
 def address(touches, features, camera, tiny_run, tmp_path_factory) -> Iterator[str]:
-    """The page without anything named, of touches, features and a film in the place of a camera."""
+    """The page without anything named, of touches, features and a video instead of a camera."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(live_module, "open_source", lambda *_: (camera, True))
         out = tmp_path_factory.mktemp("taught") / "touches"
@@ -162,7 +164,7 @@ def test_touches_are_filtered_and_played(browse):
 def test_a_surface_is_turned(browse):
     page = browse(0)
     page.get_by_role("button", name="Surface").click()
-    page.wait_for_selector("text=times as high")
+    page.wait_for_selector(SURFACE)
     canvas = page.locator(".stage canvas").first
     seen = set()
     seen.add(canvas.evaluate("canvas => canvas.toDataURL()"))
@@ -177,7 +179,7 @@ def test_a_surface_is_turned(browse):
     # still the first touch
     assert len(seen) == 4 and page.locator("input[type=number]").input_value() == "1"
     page.wait_for_selector("text=measured force, N")  # its curve
-    page.get_by_role("button", name="Picture").click()
+    page.get_by_role("button", name="Image").click()
     assert drawn(page) not in seen
 
 
@@ -288,11 +290,10 @@ def test_a_classifier_is_taught_by_touching(browse, camera):
 
 
 @pytest.mark.slow
-def test_ctrl_c_loses_no_recording(film, tiny_run, tmp_path):
+def test_ctrl_c_loses_no_recording(video, tiny_run, tmp_path):
     playwright = pytest.importorskip("playwright.sync_api")
-    words = (
-        f"view {film} --live --model {tiny_run} --sensor digit --out {tmp_path / 'out'} --port 8798"
-    )
+    words = f"view {video} --live --model {tiny_run} --sensor digit --port 8798"
+    words += f" --out {tmp_path / 'out'}"
     command = [sys.executable, "-m", "anytouch_jax", *words.split()]
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -325,7 +326,7 @@ def test_everybody_can_use_it(browse, theme):
         page.wait_for_selector(f"text={sign}")
         if tab == 0:
             page.get_by_role("button", name="Surface").click()
-            page.wait_for_selector("text=times as high")
+            page.wait_for_selector(SURFACE)
         page.evaluate("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
         page.wait_for_timeout(1000)
         page.evaluate(AXE.read_text())
@@ -349,7 +350,7 @@ def test_a_narrow_screen(browse):
 
 
 @pytest.mark.slow
-def test_on_a_phone_the_name_is_above_the_picture_and_the_button_at_the_bottom(browse, camera):
+def test_on_a_phone_the_name_is_above_the_image_and_the_button_at_the_bottom(browse, camera):
     page = browse(2, 390)
     camera.shape = "ball"
     until(page, f"{FRAMES} > 15")

@@ -82,7 +82,7 @@ def test_all_right_is_no_certainty(tmp_path, monkeypatch):
     monkeypatch.setattr(
         "anytouch_jax.live.page.accuracy.feature_cache.pixel_components", lambda *_: found.x
     )
-    monkeypatch.setattr("anytouch_jax.live.page.accuracy.UnitGels", lambda _: None)
+    monkeypatch.setattr("anytouch_jax.live.page.accuracy.Backgrounds", lambda _: None)
     result = measure_head(None, found)
     assert result["right"] == result["right_high"] == 1.0
     # Clopper and Pearson: 2.5 % of p ** 7

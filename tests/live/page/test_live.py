@@ -1,4 +1,4 @@
-"""Live touch on the page, with a film in the place of a camera."""
+"""Live touch on the page, with a video in the place of a camera."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ import cv2
 import numpy as np
 import pytest
 import uvicorn
-from films import write_film
 from starlette.testclient import TestClient
+from videos import write_video
 from view_world import SCRIPT, PressCamera
 
 from anytouch_jax.cli.app import main
@@ -34,7 +34,7 @@ from anytouch_jax.live.page.live import Live
 from anytouch_jax.live.page.recorder import SCORE, LiveRecorder
 
 PAGE = {"X-Anytouch": "1"}
-# picture, contact score and features
+# image, contact score and features
 FRAME = (np.zeros((8, 8, 3), np.uint8), 1.0, np.zeros(4, np.float32))
 
 
@@ -45,13 +45,13 @@ def encoder(tiny_run):
 
 def opened(packet: bytes) -> tuple[dict, bytes]:
     (length,) = struct.unpack_from("<I", packet)
-    (picture,) = struct.unpack_from("<I", packet, 4 + length)
-    assert len(packet) == 8 + length + picture
+    (image,) = struct.unpack_from("<I", packet, 4 + length)
+    assert len(packet) == 8 + length + image
     return json.loads(packet[4 : 4 + length]), packet[8 + length :]
 
 
-def test_a_film_in_the_place_of_a_camera(encoder, film, tmp_path):
-    live = Live(str(film), encoder, sensor="digit", out=tmp_path / "recorded", log=lambda _: None)
+def test_a_video_in_the_place_of_a_camera(encoder, video, tmp_path):
+    live = Live(str(video), encoder, sensor="digit", out=tmp_path / "recorded", log=lambda _: None)
     page = TestClient(server.app([live]), "http://127.0.0.1", raise_server_exceptions=False)
     live.start()
     runner = asyncio.Runner()
@@ -69,7 +69,7 @@ def test_a_film_in_the_place_of_a_camera(encoder, film, tmp_path):
         assert (
             first["gel"] == "estimated" and first["layer"] == "contact" and jpeg[:2] == b"\xff\xd8"
         )
-        # the film begins again
+        # the video begins again
         assert until(lambda about: about["frame"] > 15)["picture"] == "ok"
         # another site
         assert page.post("/api/0/control", json={"do": "background"}).status_code == 403
@@ -145,12 +145,15 @@ def test_live_touch_is_measured(encoder, tmp_path, monkeypatch):
 
     try:
         free, _ = until("depth", lambda about: about["frame"] > 3)
+        # a page that shows fewer pixels gets no more
+        _, small = opened(runner.run(anext(live.packets("depth", 90))))
+        assert max(cv2.imdecode(np.frombuffer(small, np.uint8), cv2.IMREAD_COLOR).shape) == 90
         live.frames.capture_background()
         camera.shape = "ball"
         for layer, shape in (("depth", (360, 480, 3)), ("surface", (54, 72, 3))):
-            pressed, picture = until(layer, lambda about: about["fields"]["area"] > 0)
+            pressed, image = until(layer, lambda about: about["fields"]["area"] > 0)
             assert (
-                picture.shape == shape
+                image.shape == shape
                 and pressed["fields"]["force"][2] > 0.1 > free["fields"]["force"][2]
             )
             assert {"contact", "force, N", "depth, mm", "slip, %"} == set(pressed["curves"])
@@ -166,8 +169,8 @@ def test_live_touch_is_measured(encoder, tmp_path, monkeypatch):
         runner.close()
 
 
-def test_a_stopped_camera_does_not_stop_the_page(encoder, film, tmp_path):
-    live = Live(str(film), encoder, sensor="digit", out=tmp_path)
+def test_a_stopped_camera_does_not_stop_the_page(encoder, video, tmp_path):
+    live = Live(str(video), encoder, sensor="digit", out=tmp_path)
     open_streams = set()
     plain = live.packets
 
@@ -250,9 +253,9 @@ def test_a_recording_that_fails_keeps_what_there_was(tmp_path):
     assert len(list(tmp_path.glob("*_cup/000000.png"))) == 1
 
 
-def test_a_source_that_ends_and_touches_of_another_encoder(encoder, features, tmp_path, film):
+def test_a_source_that_ends_and_touches_of_another_encoder(encoder, features, tmp_path, video):
     with pytest.raises(UserError, match="another encoder"):
-        Live(str(film), encoder, sensor="digit", space=FeatureMap(features, []), out=tmp_path)
+        Live(str(video), encoder, sensor="digit", space=FeatureMap(features, []), out=tmp_path)
     with pytest.raises(UserError, match="no video"):
         Live(str(tmp_path / "no.avi"), encoder, sensor="digit", out=tmp_path).start()
 
@@ -270,8 +273,8 @@ NAMES = {
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_hostile_name_is_text(name, encoder, film, tmp_path):
-    live = Live(str(film), encoder, sensor=None, out=tmp_path / "out", log=lambda _: None)
+def test_a_hostile_name_is_text(name, encoder, video, tmp_path):
+    live = Live(str(video), encoder, sensor=None, out=tmp_path / "out", log=lambda _: None)
     page = TestClient(server.app([live]), "http://127.0.0.1", raise_server_exceptions=False)
 
     def order(**body) -> int:
@@ -368,7 +371,7 @@ def test_a_classifier_taught_by_touching(encoder, tmp_path, monkeypatch, capsys)
     assert again["trained"] and set(again["names"]) == {"ball", "bar", "pins", "last"}
     assert again["result"] == after["result"]
     camera.shape = "bar"
-    film = write_film(tmp_path / "bar.avi", [camera.retrieve()[1] for _ in range(3)], 30)
+    video = write_video(tmp_path / "bar.avi", [camera.retrieve()[1] for _ in range(3)], 30)
     gel = table.file(0, "background_path")
     options = [
         "--model",
@@ -381,7 +384,7 @@ def test_a_classifier_taught_by_touching(encoder, tmp_path, monkeypatch, capsys)
         "-",
     ]
     capsys.readouterr()
-    assert main(list(map(str, ["stream", "--data", film, "--background", gel, *options]))) == 0
+    assert main(list(map(str, ["stream", "--data", video, "--background", gel, *options]))) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [json.loads(line)["label"] for line in lines if line.startswith("{")] == ["bar"] * 3
     copy = manifests.read(tmp_path / "downloaded" / "touches" / "manifest.parquet")

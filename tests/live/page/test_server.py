@@ -39,7 +39,7 @@ def page(touches, features):
     return client(touches, features)
 
 
-def picture(response) -> np.ndarray:
+def image(response) -> np.ndarray:
     assert response.status_code == 200 and response.headers["content-type"] == "image/jpeg", (
         response.text
     )
@@ -65,7 +65,7 @@ def test_a_touch_is_its_recordings_by_all_sensors(page):
     assert page.get("/api/0/touch?row=10").json()["place"] == 1
 
 
-def test_touches_are_listed_with_a_picture_each(page):
+def test_touches_are_listed_with_a_image_each(page):
     found = page.get("/api/0/touches").json()
     assert found["count"] == 2 and [one["place"] for one in found["touches"]] == [0, 1]
     # the middle of the first recording
@@ -114,13 +114,13 @@ def test_rows_in_any_order_make_the_same_touches(touches):
 def test_a_frame_shows_its_difference_and_contact(page):
     free = page.get("/api/0/frame/0?layer=difference")
     pressed = page.get("/api/0/frame/2?layer=contact")
-    assert picture(page.get("/api/0/frame/2")).shape == picture(pressed).shape == (48, 48, 3)
+    assert image(page.get("/api/0/frame/2")).shape == image(pressed).shape == (48, 48, 3)
     assert float(free.headers["x-score"]) < 1 < 20 < float(pressed.headers["x-score"])
     # an untouched gel is grey
-    assert abs(picture(free).astype(int) - 128).max() < 6
-    blue, _, red = picture(pressed)[24, 24].astype(int)
+    assert abs(image(free).astype(int) - 128).max() < 6
+    blue, _, red = image(pressed)[24, 24].astype(int)
     assert red > blue + 60  # the middle of the press is marked
-    assert picture(page.get("/api/0/photo/0")).shape == (48, 48, 3)
+    assert image(page.get("/api/0/photo/0")).shape == (48, 48, 3)
     for path in ("photo/1", "frame/12", "frame/99999999999999999999", "frame/0?layer=x"):
         assert page.get(f"/api/0/{path}").status_code == 400
 
@@ -128,7 +128,7 @@ def test_a_frame_shows_its_difference_and_contact(page):
 def test_depth_is_measured_where_the_untouched_gel_is_known(page, tmp_path):
     free, pressed = (page.get(f"/api/0/frame/{row}?layer=depth") for row in (0, 2))
     nothing, values = (json.loads(answer.headers["x-fields"]) for answer in (free, pressed))
-    assert picture(pressed).shape == (480, 480, 3) and values["unit"] == "mm"
+    assert image(pressed).shape == (480, 480, 3) and values["unit"] == "mm"
     assert (
         nothing["force"][2]
         < 0.05
@@ -141,7 +141,7 @@ def test_depth_is_measured_where_the_untouched_gel_is_known(page, tmp_path):
         and values["depth_std"] > 0
         and "slip, %" not in nothing["curves"]
     )
-    surface = picture(page.get("/api/0/frame/2?layer=surface")).astype(int)
+    surface = image(page.get("/api/0/frame/2?layer=surface")).astype(int)
     # grey
     assert np.ptp(surface.max(2) - surface.min(2)) <= 2 and surface.max() > 60
     assert "x-fields" not in page.get("/api/0/frame/2?layer=contact").headers
@@ -151,30 +151,30 @@ def test_depth_is_measured_where_the_untouched_gel_is_known(page, tmp_path):
     )
     # one frame shows no untouched gel
     unknown = client(tmp_path / "m.csv").get("/api/0/frame/0?layer=depth")
-    assert picture(unknown).shape == (32, 48, 3) and "x-fields" not in unknown.headers
+    assert image(unknown).shape == (32, 48, 3) and "x-fields" not in unknown.headers
 
 
-def test_a_film_by_its_name_with_its_own_untouched_gel(film, tmp_path):
-    shutil.copy(film, tmp_path / "film.avi")
-    page = client(tmp_path / "film.avi")
+def test_a_video_by_its_name_with_its_own_untouched_gel(video, tmp_path):
+    shutil.copy(video, tmp_path / "video.avi")
+    page = client(tmp_path / "video.avi")
     assert all(page.get(f"/api/0/frame/{row}").headers["x-score"] for row in (0, 11))
-    grey = {row: picture(page.get(f"/api/0/frame/{row}")).mean() for row in (11, 3, 4, 0, 7)}
+    grey = {row: image(page.get(f"/api/0/frame/{row}")).mean() for row in (11, 3, 4, 0, 7)}
     # frames in any order
     for row, value in grey.items():
         assert abs(value - 20 - 15 * row) < 4
     touch = page.get("/api/0/touch").json()
-    assert touch["clips"][0]["rows"] == list(range(12)) and touch["name"] == "film"
+    assert touch["clips"][0]["rows"] == list(range(12)) and touch["name"] == "video"
     # nothing is known of them
     assert not {"sensor", "split", "sequence"} & set(touch["clips"][0])
 
 
-def test_a_folder_of_pictures(tmp_path):
+def test_a_folder_of_images(tmp_path):
     for name, value in (("background", 40), ("2", 60), ("10", 80)):
         cv2.imwrite(str(tmp_path / f"{name}.png"), np.full((32, 32, 3), value, np.uint8))
     page = client(tmp_path)
     assert page.get("/api/0/touch").json()["clips"][0]["rows"] == [0, 1]
     # 2 before 10
-    assert abs(picture(page.get("/api/0/frame/0")).mean() - 60) < 2
+    assert abs(image(page.get("/api/0/frame/0")).mean() - 60) < 2
     assert (
         page.get("/api/0/frame/0").headers["x-score"]
         and page.get("/api/sources").json()[0]["name"] == tmp_path.name
@@ -271,7 +271,7 @@ def test_the_map_and_neighbours_across_sensors(page):
         assert page.get(f"/api/1/{path}").status_code == 400
 
 
-def test_features_show_pictures_of_given_files_only(page, features, touches, tmp_path):
+def test_features_show_images_of_given_files_only(page, features, touches, tmp_path):
     assert page.get("/api/sources").json()[1]["about"]["table"] == 0
     alone = client(features).get("/api/sources").json()
     # its manifest lies in its folder
@@ -343,7 +343,7 @@ def test_a_run_while_it_trains(tmp_path):
     assert page.get(f"/api/0/losses?after={rest['next']}").json()["lines"] == []
     # a file that was replaced
     assert page.get("/api/0/losses?after=999").json()["lines"][0]["step"] == 1
-    assert picture(page.get("/api/0/figure/reconstruction_000001.png")).shape == (8, 8, 3)
+    assert image(page.get("/api/0/figure/reconstruction_000001.png")).shape == (8, 8, 3)
     for name in ("secret.png", "..%2f..%2fsecret.png", "no.png"):
         assert page.get(f"/api/0/figure/{name}").status_code in (400, 404)
 

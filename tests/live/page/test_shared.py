@@ -13,7 +13,7 @@ from anytouch_jax.errors import UserError
 from anytouch_jax.live.page.recorder import LiveRecorder
 from anytouch_jax.live.page.teach import Teacher
 
-# picture, contact score and features
+# image, contact score and features
 FRAME = (np.zeros((8, 8, 3), np.uint8), 1.0, np.zeros(4, np.float32))
 
 

@@ -23,7 +23,7 @@ def encoder():
 def taught(encoder, folder, names, features):
     """Return the teacher of recordings of these names, with features (recordings, FRAMES, WIDTH).
 
-    Every recording has pictures of its own, and its frames differ by noise.
+    Every recording has images of its own, and its frames differ by noise.
     """
     rng = np.random.default_rng(1)
     recorder = LiveRecorder(folder, "digit")
@@ -31,8 +31,8 @@ def taught(encoder, folder, names, features):
         look = rng.integers(40, 200, (6, 8, 3))
         recorder.start(name, np.full((24, 32, 3), 128, np.uint8))
         for values in several:
-            picture = look.repeat(4, 0).repeat(4, 1) + rng.integers(0, 6, (24, 32, 3))
-            recorder.add(picture.astype(np.uint8), PRESSED, values.astype(np.float32))
+            image = look.repeat(4, 0).repeat(4, 1) + rng.integers(0, 6, (24, 32, 3))
+            recorder.add(image.astype(np.uint8), PRESSED, values.astype(np.float32))
         recorder.stop()
     teacher = Teacher(encoder, recorder, log=lambda _: None)
     teacher.train()

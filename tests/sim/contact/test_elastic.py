@@ -95,7 +95,7 @@ def test_a_wide_load_confines_a_thin_layer():
     assert abs(pressed[0, 0]) < 0.02 * confined
 
 
-def test_a_thick_layer_is_a_half_space_and_share_zero_too():
+def test_a_thick_layer_is_a_half_space_and_fraction_zero_too():
     plan = Plan(16, 16)
     for build in (elastic.normal_spectrum, elastic.tangential_spectra):
         deep = build(plan, 1.0, POISSON, float("inf"), 1.0, jnp.float32)

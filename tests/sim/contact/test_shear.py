@@ -64,24 +64,24 @@ def within_coulomb(state, contact, friction=MU):
     assert np.linalg.norm(state.force) <= friction * float(contact.force) * (1 + 1e-5) + 1e-9
 
 
-def mindlin(share):
+def mindlin(fraction):
     """Force over the limit at displacement over that of full slip (Cattaneo 1938, Mindlin 1949;
     Johnson 7.42).
     """
-    return 1 - (1 - np.minimum(share, 1)) ** 1.5
+    return 1 - (1 - np.minimum(fraction, 1)) ** 1.5
 
 
 def test_mindlin_force_and_stick_circle():
     states = walk(exact, [(FULL / 4, 0, 0)] * 5)
     for number, state in enumerate(states, 1):
-        share = min(number / 4, 1)
+        fraction = min(number / 4, 1)
         assert state.converged
-        assert state.force[0] == pytest.approx(MU * LOAD * mindlin(share), rel=0.01)
+        assert state.force[0] == pytest.approx(MU * LOAD * mindlin(fraction), rel=0.01)
         assert abs(state.force[1]) < 1e-5 * MU * LOAD and abs(state.twist_torque) < 1e-5 * LOAD
         stick = np.sqrt(
             ((np.asarray(CONTACT.pressure) > 0) & ~state.slipping).sum() * PITCH**2 / np.pi
         )
-        assert stick == pytest.approx(A * np.sqrt(1 - share), abs=0.05 * A)
+        assert stick == pytest.approx(A * np.sqrt(1 - fraction), abs=0.05 * A)
         within_coulomb(state, CONTACT)
     assert states[-1].slip_fraction == 1
 

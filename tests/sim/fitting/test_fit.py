@@ -1,11 +1,11 @@
-"""The fit of a sensor: hidden parameters of simulated devices come back, and unfit pictures are
+"""The fit of a sensor: hidden parameters of simulated devices come back, and unfit images are
 refused.
 """
 
 import numpy as np
 import pytest
-from hidden_sensor import colours_of_dents, hidden_pictures, true_colours
-from press_films import gel_frame
+from hidden_sensor import colours_of_dents, hidden_images, true_colours
+from press_videos import gel_frame
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.sim.fitting.fit import fit_sensor
@@ -15,7 +15,7 @@ from anytouch_jax.sim.sensing.sensors import SENSORS, look
 
 
 def step_of(markers, half, away):
-    """The distance of dots `away` mm from the middle of a picture, whose corners are `half` mm
+    """The distance of dots `away` mm from the middle of an image, whose corners are `half` mm
     away.
     """
     return markers.pitch / (1 - markers.bend + markers.bend * (away / half) ** 2)
@@ -32,7 +32,7 @@ def step_of(markers, half, away):
     ],
 )
 def test_hidden_parameters_of_a_device_are_found(tmp_path, name, ball_mm, dots, noise, most):
-    hidden = hidden_pictures(name, 2, 16, ball_mm=ball_mm, marked=dots, noise=noise)
+    hidden = hidden_images(name, 2, 16, ball_mm=ball_mm, marked=dots, noise=noise)
     fitted = fit_sensor(
         list(hidden.frames), "mine", hidden.width, tmp_path / "mine.sensor", ball_mm=ball_mm
     )
@@ -60,27 +60,27 @@ def test_hidden_parameters_of_a_device_are_found(tmp_path, name, ball_mm, dots, 
     assert np.linalg.norm((found - true)[part]) < most * np.linalg.norm(true[part])
 
 
-def pictures(look="coloured", places=range(-40, 41, 10), depth=0.9, seed=0):
+def images(look="coloured", places=range(-40, 41, 10), depth=0.9, seed=0):
     return [gel_frame(look, depth, "ball", shift, seed + n) for n, shift in enumerate(places)]
 
 
-GOOD = {"pictures": pictures(), "name": "mine", "width_mm": 18.6, "out": "mine.sensor"}
+GOOD = {"images": images(), "name": "mine", "width_mm": 18.6, "out": "mine.sensor"}
 
 
 @pytest.mark.parametrize(
     ("change", "named"),
     [
-        ({"pictures": pictures(depth=0.0)}, "no picture shows a press"),
+        ({"images": images(depth=0.0)}, "no image shows a press"),
         (
-            {"pictures": pictures(places=[0] * 6) + pictures(places=[1] * 3)},
-            "no picture shows a press|same place",
+            {"images": images(places=[0] * 6) + images(places=[1] * 3)},
+            "no image shows a press|same place",
         ),
-        ({"pictures": pictures()[:4]}, "4 pictures are too few"),
+        ({"images": images()[:4]}, "4 images are too few"),
         (
-            {"pictures": pictures() + [np.minimum(one, 225) + 30 for one in pictures(seed=50)]},
+            {"images": images() + [np.minimum(one, 225) + 30 for one in images(seed=50)]},
             "another unit",
         ),
-        ({"pictures": [*pictures(), pictures()[0][:, :100]]}, "have 2 sizes"),
+        ({"images": [*images(), images()[0][:, :100]]}, "have 2 sizes"),
         ({"width_mm": 0.5}, "the sides of a gel are 4 to 40 mm"),
         ({"width_mm": 120.0}, "4 to 40 mm"),
         ({"ball_mm": 60.0}, "a ball of 60 mm"),
@@ -100,11 +100,11 @@ def test_wrong_input_gets_a_sentence(tmp_path, change, named):
     assert "\n" not in str(error.value) and not options["out"].exists()
 
 
-def test_a_round_picture_is_of_a_sensor_that_is_not_flat(tmp_path):
+def test_a_round_image_is_of_a_sensor_that_is_not_flat(tmp_path):
     y, x = np.mgrid[:120, :160] - np.array([60, 80])[:, None, None]
-    round_ones = [one * (np.hypot(x, y) < 62)[..., None].astype(np.uint8) for one in pictures()]
+    round_ones = [one * (np.hypot(x, y) < 62)[..., None].astype(np.uint8) for one in images()]
     with pytest.raises(UserError, match="not flat"):
-        fit_sensor(**GOOD | {"pictures": round_ones, "out": tmp_path / "mine.sensor"})
+        fit_sensor(**GOOD | {"images": round_ones, "out": tmp_path / "mine.sensor"})
 
 
 def test_the_classifier_sees_a_difference_only_where_there_is_one():

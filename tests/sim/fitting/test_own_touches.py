@@ -36,12 +36,12 @@ def felt(worlds):
     return jax.device_get(own_touches(jax.random.key(0), worlds["train"], size=28))
 
 
-def test_the_first_family_is_your_sensor_and_the_splits_share_no_object(worlds):
+def test_the_first_family_is_your_sensor_and_the_splits_fraction_no_object(worlds):
     train, test = worlds["train"], worlds["test"]
     fields = [(HEIGHT, WIDTH), *(SENSORS[name].field for name in KNOWN)]
     for world in (train, test):
         np.testing.assert_allclose(world.families.field, fields, rtol=1e-6)
-        blue = np.asarray(world.gels[0, 0]).mean((0, 1))
+        blue = np.asarray(world.backgrounds[0, 0]).mean((0, 1))
         assert blue[2] > 0.4 > 0.1 > blue[0]
     reliefs = [{relief.tobytes() for relief in np.asarray(world.relief)} for world in (train, test)]
     assert all(reliefs) and not reliefs[0] & reliefs[1]
@@ -64,7 +64,7 @@ def batch_of(by_known):
     return SimulatedTouches(None, None, sensor, None, None, None, None, None, None, {})
 
 
-def test_the_score_is_the_share_of_touches_whose_nearest_is_the_same_touch():
+def test_the_score_is_the_fraction_of_touches_whose_nearest_is_the_same_touch():
     """The rivals are those of all batches by a known sensor. Twice by yours does not count."""
     held = [batch_of(np.array([1, 0, 2, 1])), batch_of(np.array([2, 2, 0, 0]))]
     other = np.eye(8, dtype=np.float32).reshape(2, 4, 8)

@@ -1,4 +1,4 @@
-"""In a rendered picture the dots move with the skin: right for shear along +x, down for +y."""
+"""In a rendered image the dots move with the skin: right for shear along +x, down for +y."""
 
 from functools import partial
 
@@ -25,19 +25,19 @@ def draw():
 
 
 def ink(draw, shear, unit):
-    """Return how much darker f64 (h, w) the picture is by its dots."""
+    """Return how much darker f64 (h, w) the image is by its dots."""
     tangential = np.broadcast_to(np.float32(shear), (*GRID, 2))
-    pictures = [
+    images = [
         draw(FLAT, tangential, unit=one) for one in (unit, unit._replace(marked=np.float32(0)))
     ]
-    dotted, plain = (np.asarray(picture, np.float64).sum(-1) for picture in pictures)
+    dotted, plain = (np.asarray(image, np.float64).sum(-1) for image in images)
     return plain - dotted
 
 
 @pytest.mark.parametrize("mirror", [(1, 1), (-1, 1), (1, -1)])
 @pytest.mark.parametrize("shear", [(0.4, 0.0), (0.0, 0.4), (-0.3, 0.5)])
 def test_dots_move_the_way_of_the_shear(draw, shear, mirror):
-    """They move by its length too. A mirrored picture shows the mirrored motion."""
+    """They move by its length too. A mirrored image shows the mirrored motion."""
     unit = MARKED._replace(mirror=np.array(mirror, np.float32))
     rest, moved = ink(draw, (0, 0), unit), ink(draw, shear, unit)
     assert rest.max() > 30

@@ -52,7 +52,7 @@ def test_no_displacement_is_the_background():
     assert behind.shape == (*SIZE, 3) and behind.dtype == jnp.uint8
 
 
-def test_a_dent_changes_the_picture_where_it_is():
+def test_a_dent_changes_the_image_where_it_is():
     for x, y in ((0.0, 0.0), (5.0, -3.0), (-6.0, 4.0)):
         change = np.abs(
             levels(draw(bump(x, y), STILL, PLAIN, KEY)) - levels(draw(FLAT, STILL, PLAIN, KEY))
@@ -69,7 +69,7 @@ def test_a_dent_changes_the_picture_where_it_is():
         )
 
 
-def test_mirror_turns_the_picture_over():
+def test_mirror_turns_the_image_over():
     for axis, mirror in ((1, [-1, 1]), (0, [1, -1])):
         unit = PLAIN._replace(mirror=np.array(mirror, np.float32))
         flipped = np.flip(levels(draw(bump(3.0, 2.0), STILL, PLAIN, KEY)), axis)
@@ -193,7 +193,7 @@ def test_a_gel_pressed_deeply_all_over_is_no_darker_than_the_deepest_dent_of_the
 
 def test_the_vignette_darkens_a_dent_as_it_darkens_the_untouched_gel():
     dark = replace(SLIM, vignette=0.8)
-    place = optics.picture_view(dark, PLAIN, SIZE)
+    place = optics.pixel_positions(dark, PLAIN, SIZE)
 
     def change(sensor):
         draw = partial(optics.render, pitch=PITCH, sensor=sensor, unit=PLAIN, resolution=SIZE)
@@ -208,7 +208,7 @@ def test_the_vignette_darkens_a_dent_as_it_darkens_the_untouched_gel():
     assert np.median(np.abs(dim[strong] - expected)) < 4 and np.abs(dim - clear)[strong].mean() > 5
 
 
-def test_dirt_and_the_fixed_pattern_lie_on_every_picture_of_a_unit():
+def test_dirt_and_the_fixed_pattern_lie_on_every_image_of_a_unit():
     specks = PLAIN.specks.copy()
     specks[0] = [0.5, 0, 0.8, 0.5, 0.5, 0.5]
     dirty = PLAIN._replace(specks=specks, grain=np.array([2, 7], np.float32))

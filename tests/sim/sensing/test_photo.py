@@ -18,7 +18,7 @@ def middle(mask):
 
 
 @pytest.mark.parametrize("thing", catalogue(2, 27)[::3], ids=lambda thing: thing.name)
-def test_a_photograph_is_a_picture_that_is_neither_black_nor_burnt(thing):
+def test_a_photograph_is_a_image_that_is_neither_black_nor_burnt(thing):
     # touches lie within 3 mm of the middle
     for place in ((-2.0, 2.0), (2.1, -2.1)):
         image = photograph(thing, place, np.random.default_rng(3), 64)
@@ -42,8 +42,8 @@ def test_the_place_is_in_the_middle_and_the_scale_is_right(seed):
     # times the tilt.
     assert np.hypot(*middle(mask)) < 8 * math.sin(math.radians(38)) / EXTENT[0]
     assert mask[44:52, 44:52].all()
-    share = mask.mean()
-    assert 0.8 * math.pi * 64 / EXTENT[1] ** 2 < share < 1.25 * math.pi * 64 / EXTENT[0] ** 2
+    fraction = mask.mean()
+    assert 0.8 * math.pi * 64 / EXTENT[1] ** 2 < fraction < 1.25 * math.pi * 64 / EXTENT[0] ** 2
 
 
 def fineness(image):

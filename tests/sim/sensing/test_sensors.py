@@ -38,7 +38,7 @@ def test_an_untouched_gel_is_neither_black_nor_burnt_and_has_colours(name):
         assert base.reshape(-1, 3).std(0).min() > 0.01, "every channel varies over the image"
 
 
-def test_a_digit_shades_as_in_real_pictures():
+def test_a_digit_shades_as_in_real_images():
     """Real DIGITs show the flank that faces up orange, the one that faces down blue, the right one
     green.
     """
@@ -95,7 +95,7 @@ def test_a_unit_follows_from_the_seed_alone():
     assert len({stream.uniform() for stream in streams}) == 1, "every sensor takes as many draws"
 
 
-def test_units_stay_inside_the_field_and_carry_markers_by_share():
+def test_units_stay_inside_the_field_and_carry_markers_by_fraction():
     sensor = SENSORS["gelsight_mini"]
     rng = np.random.default_rng(6)
     drawn = [sensors.draw_unit(sensor, rng) for _ in range(300)]

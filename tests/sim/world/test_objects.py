@@ -92,10 +92,10 @@ def test_labels_have_three_classes_each_and_follow_the_object():
     )
 
 
-@pytest.mark.parametrize("share", [0.05, 0.2, 0.35])
+@pytest.mark.parametrize("fraction", [0.05, 0.2, 0.35])
 @pytest.mark.parametrize("seed", range(2))
-def test_whole_pairs_are_held_out(share, seed):
-    received, unseen = hold_out(THINGS, share, seed)
+def test_whole_pairs_are_held_out(fraction, seed):
+    received, unseen = hold_out(THINGS, fraction, seed)
     assert sorted((*received, *unseen), key=THINGS.index) == list(THINGS)
     assert list(received) == sorted(received, key=THINGS.index) and list(unseen) == sorted(
         unseen, key=THINGS.index
@@ -105,5 +105,5 @@ def test_whole_pairs_are_held_out(share, seed):
         t.shape.texture for t in received
     } == set(TEXTURES)
     largest = max(Counter(t.kind for t in THINGS).values())
-    assert share * 64 <= len(unseen) < share * 64 + largest
-    assert hold_out(THINGS, share, seed) == (received, unseen)
+    assert fraction * 64 <= len(unseen) < fraction * 64 + largest
+    assert hold_out(THINGS, fraction, seed) == (received, unseen)

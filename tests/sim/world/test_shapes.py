@@ -60,7 +60,7 @@ def test_the_thread_winds():
     crest = height(shape, np.zeros(200), y)
     np.testing.assert_allclose(height(shape, np.zeros(200), y + pitch), crest, atol=1e-9)
     assert np.ptp(crest) == pytest.approx(0.5 * pitch, rel=0.01)
-    # A turn about the axis by asin(x / r) moves the thread by that share of the pitch; the rod's
+    # A turn about the axis by asin(x / r) moves the thread by that fraction of the pitch; the rod's
     # own fall aside.
     x = 2.0
     moved = pitch * math.asin(x / 4) / (2 * math.pi)

@@ -52,9 +52,9 @@ def test_an_open_grid_gives_what_full_arrays_give(name):
     ("texture", "pitch", "depth"), [("sand", 0.9, 0.12), ("sand", 2.0, 0.4), ("bark", 1.1, 0.3)]
 )
 def test_roughness_has_the_rms_and_the_correlation_lengths_that_it_states(texture, pitch, depth):
-    shares = {"sand": (12.0**-0.5, 0.35, 0.35), "bark": (0.31, 0.27, 1.03)}[texture]
-    rms = shares[0] * depth
-    lengths = np.multiply(shares[1:], pitch)
+    fractions = {"sand": (12.0**-0.5, 0.35, 0.35), "bark": (0.31, 0.27, 1.03)}[texture]
+    rms = fractions[0] * depth
+    lengths = np.multiply(fractions[1:], pitch)
     step = min(lengths) / 5
     x, y = axes(200, step)
     found_rms = []

@@ -96,7 +96,7 @@ class ContactReport:
         ]
         faults = self.scores.faults
         if faults:
-            lines.append("pictures that cannot be used:")
+            lines.append("images that cannot be used:")
             lines += [f"  {fault}" for fault in faults[:EXAMPLES]]
         if len(faults) > EXAMPLES:
             lines.append("  (and more: `anytouch data verify` names them)")
@@ -108,7 +108,7 @@ class ContactReport:
         return [*lines, last]
 
     def _estimated(self) -> list[str]:
-        """Return the line on recordings without a background picture, none if all have one."""
+        """Return the line on recordings without a background image, none if all have one."""
         all_of = self.scores.recordings
         decided = self.scores.decided
         if not all_of:
@@ -120,7 +120,7 @@ class ContactReport:
         if decided < all_of:
             line += (
                 ". The labels of the others stay empty. To decide them, pass --background with "
-                "a picture of the untouched gel"
+                "an image of the untouched gel"
             )
         return [line]
 
@@ -130,31 +130,31 @@ def mark_contact(
     scores: ContactScores,
     *,
     thresholds: Mapping[str, float] | None = None,
-    share: float = 0.0,
+    fraction: float = 0.0,
     drop: bool = False,
 ) -> tuple[Manifest, ContactReport]:
     """Return the manifest with its contact labels, and a report.
 
     The columns are `label.contact_score` and `label.contact` (1, 0 or null if unknown). An existing
-    `label.contact` is kept, because its writer knew more than a picture shows. An existing score
+    `label.contact` is kept, because its writer knew more than an image shows. An existing score
     column is renamed to `<name>_given`.
 
     Args:
         manifest: The frames.
         scores: Of its rows.
         thresholds: By sensor, in place of those of THRESHOLDS.
-        share: Contact also needs this fraction of the highest score of its sequence, which excludes
-            the start and the end of contact.
+        fraction: Contact also needs this fraction of the highest score of its sequence, which
+            excludes the start and the end of contact.
         drop: Remove frames without contact, but never the split `background` nor frames of unknown
             contact.
 
     Raises:
         UserError: If nothing would be left.
     """
-    limits = threshold_of_rows(manifest, thresholds, share)
+    limits = threshold_of_rows(manifest, thresholds, fraction)
     known = known_contact(manifest)
     background = manifest.text_column("split") == "background"
-    contact = _decided(manifest, scores.score, limits, share)
+    contact = _decided(manifest, scores.score, limits, fraction)
     contact[background] = 0
     contact = np.where(np.isnan(known), contact, known > 0)
     free = contact == 0
@@ -163,7 +163,7 @@ def mark_contact(
     if not stays.any():
         raise UserError(
             "every frame is without contact by these thresholds; nothing would be left. "
-            "Lower --threshold or --share, or leave out --drop"
+            "Lower --threshold or --fraction, or leave out --drop"
         )
     sensors = manifest.table["sensor"].to_pylist()
     report = ContactReport(
@@ -178,12 +178,14 @@ def mark_contact(
     return select_rows(marked, np.flatnonzero(stays)), report
 
 
-def _decided(manifest: Manifest, score: np.ndarray, limits: np.ndarray, share: float) -> np.ndarray:
+def _decided(
+    manifest: Manifest, score: np.ndarray, limits: np.ndarray, fraction: float
+) -> np.ndarray:
     """Return the contact of every row by its score, f64 (rows,): 1, 0 or NaN without a score."""
     sequence = manifest.codes("sequence", own=True)
     highest = np.zeros(sequence.max() + 1)
     np.fmax.at(highest, sequence, score)
-    is_contact = (score > limits) & (score >= share * highest[sequence])
+    is_contact = (score > limits) & (score >= fraction * highest[sequence])
     return np.where(np.isnan(score), np.nan, is_contact)
 
 

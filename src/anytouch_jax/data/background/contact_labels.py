@@ -31,21 +31,21 @@ _WORDS = {"true": 1.0, "false": 0.0, "none": np.nan, "": np.nan}
 
 
 def threshold_of_rows(
-    manifest: Manifest, thresholds: Mapping[str, float] | None, share: float
+    manifest: Manifest, thresholds: Mapping[str, float] | None, fraction: float
 ) -> np.ndarray:
     """Return the threshold of every row, f64 (rows,).
 
     Args:
         manifest: The frames.
         thresholds: By sensor, in place of those of THRESHOLDS.
-        share: As in `mark_contact`; it is only checked here.
+        fraction: As in `mark_contact`; it is only checked here.
 
     Raises:
-        UserError: For thresholds or a share that cannot be used.
+        UserError: For thresholds or a fraction that cannot be used.
     """
-    if not 0 <= share <= 1:
+    if not 0 <= fraction <= 1:
         raise UserError(
-            f"--share is a part of the highest score of a sequence, 0 to 1, not {share:g}"
+            f"--fraction is a part of the highest score of a sequence, 0 to 1, not {fraction:g}"
         )
     given = thresholds or {}
     table = {**THRESHOLDS, **given}

@@ -1,4 +1,4 @@
-"""Quality of the contact filter: compared with a column that reports contact, and as a picture."""
+"""Quality of the contact filter: compared with a column that reports contact, and as an image."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from anytouch_jax.data.background.contact_labels import (
     threshold_of_rows,
 )
 from anytouch_jax.data.background.contact_scores import ContactScores, spread
-from anytouch_jax.data.background.estimate import scale_picture
+from anytouch_jax.data.background.estimate import scale_image
 from anytouch_jax.data.images import ImageError, decode
 from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.errors import UserError
@@ -25,7 +25,7 @@ from anytouch_jax.files import atomic_write
 TILE = 120
 PER_ROW = 10
 _HEAD = 28  # pixels of the height of a title
-_MARGIN = 20  # pixels of a tile around its picture, for the score
+_MARGIN = 20  # pixels of a tile around its image, for the score
 # BGR, as OpenCV writes
 _RED = (60, 60, 230)
 _GREEN = (80, 180, 60)
@@ -104,7 +104,7 @@ def contact_quality(
     if not used.size:
         raise UserError(
             f"no row has both a value in {name} and a score; name another column with --reference, "
-            "or give a picture of the untouched gel with --background"
+            "or give an image of the untouched gel with --background"
         )
     score = scores.score[used]
     sources = scores.reasons[used]
@@ -167,7 +167,7 @@ def contact_sheet(
     is_scored = ~np.isnan(scores.score) & (manifest.text_column("split") != "background")
     if not is_scored.any():
         raise UserError(
-            "no frame has a contact score, so there is nothing to show; leave out --picture"
+            "no frame has a contact score, so there is nothing to show; leave out --image"
         )
     contact = scores.score > threshold_of_rows(manifest, thresholds, 0.0)
     bands = []
@@ -197,7 +197,7 @@ def _tile(manifest: Manifest, row: int, score: float, colour: Colour) -> np.ndar
         image = decode(manifest.file(row))[..., ::-1]
     except ImageError:
         return tile
-    image = scale_picture(image, TILE - _MARGIN)
+    image = scale_image(image, TILE - _MARGIN)
     height, width = image.shape[:2]
     left = (TILE - width) // 2
     tile[2 : 2 + height, left : left + width] = image
@@ -210,7 +210,5 @@ def _blank(height: int, width: int) -> np.ndarray:
     return np.full((height, width, 3), 255, np.uint8)
 
 
-def _write(
-    picture: np.ndarray, text: str, at: tuple[int, int], size: float, colour: Colour
-) -> None:
-    cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, colour, 1, cv2.LINE_AA)
+def _write(image: np.ndarray, text: str, at: tuple[int, int], size: float, colour: Colour) -> None:
+    cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, colour, 1, cv2.LINE_AA)

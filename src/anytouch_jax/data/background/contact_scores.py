@@ -6,7 +6,7 @@ Marker dots, which shear moves, are closed in both images if the gel has them. A
 subtracted as a plane for each colour.
 
 The background of a row is its `background_path`, the rows of split `background` of its sensor
-instance (or else sequence), or a picture that the user names. Otherwise it is estimated from the
+instance (or else sequence), or an image that the user names. Otherwise it is estimated from the
 frames of its recording, and compared with the estimates of other recordings of the instance. Where
 these are undecided, it is the median of the instance's frames, if that is free.
 
@@ -31,13 +31,13 @@ import pyarrow.compute as pc
 from anytouch_jax.data.background.estimate import (
     DIFFERENT,
     EDGE,
-    UntouchedGel,
-    estimate_untouched_gel,
-    gel_of_unit,
-    median_gel,
-    scale_picture,
+    UntouchedBackground,
+    background_of_unit,
+    estimate_background_image,
+    median_background,
+    scale_image,
 )
-from anytouch_jax.data.background.rule import UnitGels
+from anytouch_jax.data.background.rule import Backgrounds
 from anytouch_jax.data.images import decode, encode
 from anytouch_jax.data.manifest.manifest import Manifest, group_rows, replace_column
 from anytouch_jax.data.manifest.schema import EXAMPLES, shown
@@ -50,7 +50,7 @@ _MAX_RECORDINGS = 48
 _MANY = 3  # recordings of an instance whose median shows where nothing presses
 _FEWEST_FRAMES = 3  # of a recording; shorter ones are stills, which are estimated together
 _STILLS = -2  # a sequence code that no sequence has
-_MAX_FAULTS = 1000  # a million broken pictures must not fill the memory
+_MAX_FAULTS = 1000  # a million broken images must not fill the memory
 _AT_ONCE = 1024  # rows that wait for a thread: millions of rows must not wait in memory
 
 
@@ -61,18 +61,18 @@ class ContactScores:
     Attributes:
         score: f32 (rows,), NaN if unknown.
         reasons: (rows,), the source of the background, or why it failed.
-        recordings: Number of recordings without a background picture.
+        recordings: Number of recordings without a background image.
         decided: For how many of these the background was estimated.
-        gels: Rows without a background picture whose background was given otherwise or estimated,
-            with it.
-        faults: A sentence for each of the first rows whose pictures cannot be used.
+        backgrounds: Rows without a background image whose background was given otherwise or
+            estimated, with it.
+        faults: A sentence for each of the first rows whose images cannot be used.
     """
 
     score: np.ndarray
     reasons: np.ndarray
     recordings: int = 0
     decided: int = 0
-    gels: tuple[tuple[np.ndarray, UntouchedGel], ...] = ()
+    backgrounds: tuple[tuple[np.ndarray, UntouchedBackground], ...] = ()
     faults: tuple[str, ...] = ()
 
     @property
@@ -85,8 +85,8 @@ def contact_scores(
     manifest: Manifest,
     rows: np.ndarray | None = None,
     *,
-    backgrounds: Mapping[str, UntouchedGel] | None = None,
-    gels: UnitGels | None = None,
+    backgrounds: Mapping[str, UntouchedBackground] | None = None,
+    served: Backgrounds | None = None,
     workers: int = 2,
 ) -> ContactScores:
     """Return the score of every row, or of some.
@@ -97,22 +97,22 @@ def contact_scores(
     Args:
         manifest: The frames.
         rows: Row ids, by default all.
-        backgrounds: Pictures from `read_backgrounds` for rows without one.
-        gels: Serve all rows by the rule of `rule.py`, instead of estimates by recording.
-        workers: Threads that read pictures.
+        backgrounds: Images from `read_backgrounds` for rows without one.
+        served: Serve all rows by the rule of `rule.py`, instead of estimates by recording.
+        workers: Threads that read images.
     """
     if workers < 1:
         raise UserError(f"--threads (workers) must be at least 1, not {workers}")
     rows = np.arange(len(manifest)) if rows is None else np.asarray(rows)
     with ThreadPoolExecutor(workers) as pool:
         scorer = _Scorer(manifest, pool)
-        if gels is not None:
-            has_background = gels.has(rows)
-            scorer.refuse(rows[~has_background], "none: no picture of the untouched gel")
-            scorer.score_given(gels, rows[has_background])
+        if served is not None:
+            has_background = served.has(rows)
+            scorer.refuse(rows[~has_background], "none: no image of the untouched gel")
+            scorer.score_given(served, rows[has_background])
         else:
             has_background = manifest.present("background_path")[rows]
-            scorer.score_given(UnitGels(manifest), rows[has_background])
+            scorer.score_given(Backgrounds(manifest), rows[has_background])
             for group in _groups(manifest, rows[~has_background]):
                 scorer.score_group(group, backgrounds or {})
     return scorer.result()
@@ -121,7 +121,7 @@ def contact_scores(
 class _Estimate(NamedTuple):
     """The background of one recording, or None and why; `shape` is () if no frame can be read."""
 
-    gel: UntouchedGel | None
+    gel: UntouchedBackground | None
     reason: str
     shape: tuple[int, ...]
 
@@ -136,7 +136,7 @@ class _Scorer:
         self._reasons = np.full(len(manifest), "not asked for", dtype=object)
         self._recordings = 0
         self._decided = 0
-        self._found: list[tuple[np.ndarray, UntouchedGel]] = []
+        self._found: list[tuple[np.ndarray, UntouchedBackground]] = []
         self._faults: dict[int, str] = {}
 
     def result(self) -> ContactScores:
@@ -157,13 +157,15 @@ class _Scorer:
         """Give rows no score."""
         self._reasons[rows] = reason
 
-    def score_given(self, gels: UnitGels, rows: np.ndarray) -> None:
+    def score_given(self, served: Backgrounds, rows: np.ndarray) -> None:
         """Score rows that have a background by the rule."""
-        gel_of_row = gels.shared(UntouchedGel)
+        gel_of_row = served.shared(UntouchedBackground)
         self._assign(lambda row: self._score_row(gel_of_row, "given", row), rows)
 
-    def score_group(self, group: np.ndarray, backgrounds: Mapping[str, UntouchedGel]) -> None:
-        """Score the rows of one sensor instance that have no background picture."""
+    def score_group(
+        self, group: np.ndarray, backgrounds: Mapping[str, UntouchedBackground]
+    ) -> None:
+        """Score the rows of one sensor instance that have no background image."""
         gel, source = self._gel_of_group(group, backgrounds)
         if gel is not None:
             self._score_by(gel, source, group)
@@ -176,7 +178,7 @@ class _Scorer:
                 self._decided += 1
                 self._score_by(estimated, source, recording)
 
-    def _score_by(self, gel: UntouchedGel, source: str, rows: np.ndarray) -> None:
+    def _score_by(self, gel: UntouchedBackground, source: str, rows: np.ndarray) -> None:
         self._found.append((rows, gel))
         self._assign(lambda row: self._score_row(lambda _: gel, source, row), rows)
 
@@ -188,7 +190,7 @@ class _Scorer:
                 self._reasons[row] = reason
 
     def _score_row(
-        self, gel_of_row: Callable[[int], UntouchedGel | None], source: str, row: int
+        self, gel_of_row: Callable[[int], UntouchedBackground | None], source: str, row: int
     ) -> tuple[float, str]:
         try:
             frame = decode(self._manifest.file(row))
@@ -207,22 +209,22 @@ class _Scorer:
             self._faults[row] = sentence
 
     def _gel_of_group(
-        self, group: np.ndarray, backgrounds: Mapping[str, UntouchedGel]
-    ) -> tuple[UntouchedGel | None, str]:
+        self, group: np.ndarray, backgrounds: Mapping[str, UntouchedBackground]
+    ) -> tuple[UntouchedBackground | None, str]:
         """Return the background by rows of the split `background`, or else by `backgrounds`."""
         split = self._manifest.table["split"].take(group)
         free = group[np.asarray(pc.equal(split, "background"))]
-        frames = self._pictures(free)
+        frames = self._images(free)
         if frames:
-            gel = UntouchedGel(np.median(frames, axis=0).astype(np.uint8))
+            gel = UntouchedBackground(np.median(frames, axis=0).astype(np.uint8))
             return gel, "rows of split background"
         unit = self._manifest.column("unit")[int(group[0])].as_py() or ""
-        # "" is the picture for all
+        # "" is the image for all
         return backgrounds.get(unit, backgrounds.get("")), "--background"
 
     def _estimates(
         self, group: np.ndarray
-    ) -> Iterator[tuple[np.ndarray, UntouchedGel | None, str]]:
+    ) -> Iterator[tuple[np.ndarray, UntouchedBackground | None, str]]:
         """Yield rows, background and reason of each recording of an instance.
 
         Stills are one recording. Other recordings of the instance decide too: a press that is held
@@ -234,49 +236,47 @@ class _Scorer:
         recordings = group_rows(group, recording_of)
         voters = spread(np.arange(len(recordings)), _MAX_RECORDINGS).tolist()
         estimates = {voter: self._estimate(recordings[voter]) for voter in voters}
-        by_shape: dict[tuple[int, ...], list[UntouchedGel]] = {}
+        by_shape: dict[tuple[int, ...], list[UntouchedBackground]] = {}
         for one in estimates.values():
             known = by_shape.setdefault(one.shape, [])
             if one.gel is not None:
                 known.append(one.gel)
-        common = {shape: gel_of_unit(gels) for shape, gels in by_shape.items()}
-        usual = median_gel(self._pictures(group)) if len(recordings) >= _MANY else None
+        common = {shape: background_of_unit(backgrounds) for shape, backgrounds in by_shape.items()}
+        usual = median_background(self._images(group)) if len(recordings) >= _MANY else None
         for place, recording in enumerate(recordings):
             gel, reason, shape = estimates.get(place) or self._estimate(recording)
             agreed = common.get(shape)
-            rivals = by_shape.get(shape, []) if agreed is None else [agreed]
+            negatives = by_shape.get(shape, []) if agreed is None else [agreed]
             if gel is None and agreed is not None:
                 yield recording, agreed, "estimated from other recordings of the unit"
-            elif gel is not None and any(one.score(gel.picture) >= DIFFERENT for one in rivals):
+            elif gel is not None and any(one.score(gel.image) >= DIFFERENT for one in negatives):
                 yield recording, None, "recordings of its unit show different untouched gels"
-            elif gel is None and usual is not None and usual.picture.shape == shape:
+            elif gel is None and usual is not None and usual.image.shape == shape:
                 yield recording, usual, "the median of the unit"
             else:
                 yield recording, gel, reason
 
     def _estimate(self, rows: np.ndarray) -> _Estimate:
-        frames = self._pictures(rows)
-        gel, reason = estimate_untouched_gel(frames)
+        frames = self._images(rows)
+        gel, reason = estimate_background_image(frames)
         shape = frames[0].shape if frames else ()
         return _Estimate(gel, reason, shape)
 
-    def _pictures(self, rows: np.ndarray) -> list[np.ndarray]:
+    def _images(self, rows: np.ndarray) -> list[np.ndarray]:
         """Return at most _MAX_FRAMES evenly spaced scaled frames, those of the commonest shape."""
         loaded = self._pool.map(self._load_or_none, spread(rows, _MAX_FRAMES).tolist())
-        pictures = [
-            picture
-            for picture in loaded
-            if picture is not None and min(picture.shape[:2]) > 2 * EDGE + 2
+        images = [
+            image for image in loaded if image is not None and min(image.shape[:2]) > 2 * EDGE + 2
         ]
-        if not pictures:
+        if not images:
             return []
-        shapes = Counter(picture.shape for picture in pictures)
+        shapes = Counter(image.shape for image in images)
         commonest = shapes.most_common(1)[0][0]
-        return [picture for picture in pictures if picture.shape == commonest]
+        return [image for image in images if image.shape == commonest]
 
     def _load_or_none(self, row: int) -> np.ndarray | None:
         try:
-            return scale_picture(decode(self._manifest.file(row)))
+            return scale_image(decode(self._manifest.file(row)))
         except UserError as error:
             self._note(row, str(error))
             return None
@@ -307,59 +307,59 @@ def store_backgrounds(manifest: Manifest, scores: ContactScores, folder: Path) -
     """
     cells = manifest.column("background_path").to_pylist()
     is_free = manifest.text_column("split") == "background"
-    for rows, gel in scores.gels:
+    for rows, gel in scores.backgrounds:
         # by content, so that a second run writes the same files
-        name = folder / f"{sha256(gel.picture.tobytes()).hexdigest()[:16]}.png"
-        atomic_write(name, encode(gel.picture))
+        name = folder / f"{sha256(gel.image.tobytes()).hexdigest()[:16]}.png"
+        atomic_write(name, encode(gel.image))
         for row in rows[~is_free[rows]].tolist():
             root = manifest.files[manifest.source[row]].parent
             cells[row] = Path(os.path.relpath(name, root)).as_posix()
     return replace_column(manifest, "background_path", cells)
 
 
-def read_backgrounds(manifest: Manifest, words: Sequence[str]) -> dict[str, UntouchedGel]:
-    """Return the pictures of --background, FILE (unit "") or UNIT=FILE words, by unit.
+def read_backgrounds(manifest: Manifest, words: Sequence[str]) -> dict[str, UntouchedBackground]:
+    """Return the images of --background, FILE (unit "") or UNIT=FILE words, by unit.
 
     Raises UserError.
     """
     waiting = np.flatnonzero(~manifest.present("background_path"))
     units = manifest.text_column("unit")
-    gels: dict[str, UntouchedGel] = {}
+    backgrounds: dict[str, UntouchedBackground] = {}
     for word in words:
         # a file may have = in its name
         is_file = "=" not in word or (len(words) == 1 and Path(word).exists())
         unit, _, file = ("", "", word) if is_file else word.partition("=")
-        if unit in gels or (not unit and len(words) > 1):
+        if unit in backgrounds or (not unit and len(words) > 1):
             raise UserError(
-                f"--background {word}: give one picture for all recordings, or one UNIT=FILE for "
+                f"--background {word}: give one image for all recordings, or one UNIT=FILE for "
                 "each unit"
             )
-        gels[unit] = UntouchedGel(decode(Path(file).expanduser()))
+        backgrounds[unit] = UntouchedBackground(decode(Path(file).expanduser()))
         rows = waiting[units[waiting] == unit] if unit else waiting
         if not len(rows):
             kind = f"of unit {unit} " if unit else ""
             raise UserError(
-                f"--background {word}: the manifest has no row {kind}without a background picture"
+                f"--background {word}: the manifest has no row {kind}without a background image"
             )
-        _check_shape(manifest, rows, gels[unit], file)
-    return gels
+        _check_shape(manifest, rows, backgrounds[unit], file)
+    return backgrounds
 
 
-def _check_shape(manifest: Manifest, rows: np.ndarray, gel: UntouchedGel, file: str) -> None:
+def _check_shape(manifest: Manifest, rows: np.ndarray, gel: UntouchedBackground, file: str) -> None:
     """Raise UserError unless the background fits the first of these rows of each sensor."""
     sensors = manifest.codes("sensor")
     _, first = np.unique(sensors[rows], return_index=True)
     for row in rows[first].tolist():
         try:
-            picture = decode(manifest.file(row))
+            image = decode(manifest.file(row))
         except UserError:  # the score of this row says so
             continue
         try:
-            gel.score(scale_picture(picture))
+            gel.score(scale_image(image))
         except ValueError:
             raise UserError(
                 f"--background {file} has other proportions than {manifest.where(row)}. "
-                "Pass a picture of the same camera and cut, or name the unit as in UNIT=FILE."
+                "Pass an image of the same camera and cut, or name the unit as in UNIT=FILE."
             ) from None
 
 

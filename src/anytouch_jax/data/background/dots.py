@@ -10,10 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from anytouch_jax.data import opencv
-from anytouch_jax.data.background.estimate import scale_picture
+from anytouch_jax.data.background.estimate import scale_image
 
 Array = npt.NDArray[Any]
-# pixels of the long side of a picture in which dots are found, and of one in which they move
+# pixels of the long side of an image in which dots are found, and of one in which they move
 LONG = 320
 FLOW = 240
 FEWEST = 12
@@ -25,8 +25,8 @@ FAINT = 12
 STEADY = 0.2
 UNSTEADY = 0.5
 
-_WIDEST = 0.045  # of a dot, as a fraction of the long side of the picture
-_COVERED = 0.35  # fraction of the picture that a lattice covers at least
+_WIDEST = 0.045  # of a dot, as a fraction of the long side of the image
+_COVERED = 0.35  # fraction of the image that a lattice covers at least
 _STRONG = 0.5  # of a dot's largest change: colours that change less are left out
 _IN_A_ROW = 3  # fits of the lattice, each without the steps that the last one fits worst
 
@@ -68,14 +68,14 @@ def find_dots(gel: Array) -> Dots | None:
     return _dots_of(gel, -1)
 
 
-def _spots(picture: Array, sign: int, shape: int = cv2.MORPH_ELLIPSE) -> Array:
+def _spots(image: Array, sign: int, shape: int = cv2.MORPH_ELLIPSE) -> Array:
     """Return by how many grey levels u8 (h, w, 3) small spots differ from what is around.
 
     With `sign` 1 it is by how much they are darker, with -1 lighter. It is a black-hat transform:
     what a closing with a kernel wider than a dot fills.
     """
-    shown = picture if sign > 0 else 255 - picture
-    side = 2 * round(_WIDEST * max(picture.shape[:2])) + 1
+    shown = image if sign > 0 else 255 - image
+    side = 2 * round(_WIDEST * max(image.shape[:2])) + 1
     kernel = cv2.getStructuringElement(shape, (side, side))
     return np.asarray(cv2.subtract(cv2.morphologyEx(shown, cv2.MORPH_CLOSE, kernel), shown))
 
@@ -87,8 +87,8 @@ def hidden(frame: Array, dots: Dots) -> Array:
     """
     # a dot changes these colours all at once, and a slope does not
     strong = dots.change >= _STRONG * dots.change.max()
-    share = (_spots(frame, dots.sign)[..., strong] / dots.change[strong]).min(-1)
-    now = cv2.dilate((share > 0.3).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    fraction = (_spots(frame, dots.sign)[..., strong] / dots.change[strong]).min(-1)
+    now = cv2.dilate((fraction > 0.3).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     return dots.mask | now
 
 
@@ -151,7 +151,7 @@ def _blobs(deep: Array, threshold: float) -> list[_Blob]:
     for number, (x, y, w, h, area) in enumerate(stats[1:], 1):
         edge = min(x, y, width - x - w, height - y - h)
         is_speck = area < 4 or area > (0.1 * max(height, width)) ** 2
-        # wider than high is allowed: pictures of some sensors are stretched along x
+        # wider than high is allowed: images of some sensors are stretched along x
         is_line = w > 3.5 * h or h > 2.5 * w
         if edge < 1 or is_speck or is_line:
             continue
@@ -181,7 +181,7 @@ def _lattice(
         at: Places (N, 2), pixels.
         apart: Distances (N, N), infinite on the diagonal.
         rough: A first guess of the step, pixels.
-        shape: Of the picture, (h, w, 3).
+        shape: Of the image, (h, w, 3).
 
     Returns:
         Step in the middle, bend, and the spread of the steps, which is infinite for few.
@@ -212,13 +212,13 @@ def _lattice(
 class DotFlow:
     """How the dots of a background have moved: dense optical flow of their ink.
 
-    The flow is DIS (Kroeger et al. 2016). Of the whole picture it would follow the colours of a
-    press, so it sees the ink alone. The object is false if the picture `gel` u8 (h, w, 3) shows no
+    The flow is DIS (Kroeger et al. 2016). Of the whole image it would follow the colours of a
+    press, so it sees the ink alone. The object is false if the image `gel` u8 (h, w, 3) shows no
     dots.
     """
 
     def __init__(self, gel: Array) -> None:
-        small = scale_picture(gel, LONG)
+        small = scale_image(gel, LONG)
         self._dots = dots = _cached_dots(small.tobytes(), small.shape)
         if dots is not None:
             self._strong = dots.change >= _STRONG * dots.change.max()
@@ -230,10 +230,10 @@ class DotFlow:
     def __bool__(self) -> bool:
         return self._dots is not None
 
-    def _ink(self, picture: Array) -> Array:
+    def _ink(self, image: Array) -> Array:
         """Return the ink of dots u8 (h, w) at FLOW pixels: 160 in the middle of a dot, else 0."""
         assert self._dots is not None
-        shown = np.ascontiguousarray(scale_picture(picture, FLOW)[..., self._strong])
+        shown = np.ascontiguousarray(scale_image(image, FLOW)[..., self._strong])
         dark = _spots(shown, self._dots.sign, cv2.MORPH_RECT)
         levels = 160 / self._dots.change[self._strong]
         parts = [
@@ -253,7 +253,7 @@ class DotFlow:
 
         Returns:
             Shifts (rows, columns, 2) along x and y, and their standard deviations (rows, columns),
-            both over the width of the picture.
+            both over the width of the image.
         """
         assert self._dots is not None
         height, width = self._gel.shape
@@ -281,5 +281,5 @@ class DotFlow:
 
 @lru_cache(maxsize=16)
 def _cached_dots(values: bytes, shape: tuple[int, ...]) -> Dots | None:
-    """Return the dots of a picture by its bytes, as each recording asks about the same few."""
+    """Return the dots of an image by its bytes, as each recording asks about the same few."""
     return find_dots(np.frombuffer(values, np.uint8).reshape(shape))

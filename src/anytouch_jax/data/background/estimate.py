@@ -5,7 +5,7 @@ presses. The estimate is the group of alike frames that has less structure than 
 differ from it, however long the press lasts. Where no group stands out, or it shows a light press
 itself, the background cannot be known from the frames.
 
-All lengths are in pixels of a picture with LONG_SIDE pixels on its long side, see `scale_picture`.
+All lengths are in pixels of an image with LONG_SIDE pixels on its long side, see `scale_image`.
 """
 
 from __future__ import annotations
@@ -35,32 +35,35 @@ DIFFERENT = 6.5
 # least excess of structure, as a fraction of the sum; measured on real and simulated recordings
 MARGIN = 0.1
 
+# of the largest part of contact, and of the picture: less than that is noise
+_ISLAND = 0.1
+_SPECK = 2e-4
 _FITTING = 0.6  # fraction of the cells that a change of light is fitted to
 _AT = (np.arange(FIT, dtype=np.float32) + 0.5) / FIT - 0.5
 # The terms 1, x and y of a plane, in each cell.
 _TERMS = np.stack([np.ones(FIT * FIT, np.float32), np.tile(_AT, FIT), np.repeat(_AT, FIT)], 1)
 
 
-def scale_picture(picture: np.ndarray, long_side: int = LONG_SIDE) -> np.ndarray:
-    """Scale a picture to `long_side` pixels on its long side."""
+def scale_image(image: np.ndarray, long_side: int = LONG_SIDE) -> np.ndarray:
+    """Scale an image to `long_side` pixels on its long side."""
     opencv.set_up()
-    height, width = picture.shape[:2]
+    height, width = image.shape[:2]
     shrink = long_side / max(height, width)
     size = max(1, round(width * shrink)), max(1, round(height * shrink))
     interpolation = cv2.INTER_AREA if shrink < 1 else cv2.INTER_LINEAR
-    return cv2.resize(picture, size, interpolation=interpolation)
+    return cv2.resize(image, size, interpolation=interpolation)
 
 
-def close_dots(picture: np.ndarray) -> np.ndarray:
+def close_dots(image: np.ndarray) -> np.ndarray:
     """Fill dark dots and thin dark lines, which shear moves without any change of contact."""
     return cv2.morphologyEx(
-        picture, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (DOT, DOT))
+        image, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (DOT, DOT))
     )
 
 
-def has_dots(picture: np.ndarray) -> bool:
-    """Return whether a scaled picture of the untouched gel shows marker dots."""
-    depth = cv2.GaussianBlur(cv2.subtract(close_dots(picture), picture).max(2), (0, 0), 1)
+def has_dots(image: np.ndarray) -> bool:
+    """Return whether a scaled image of the untouched gel shows marker dots."""
+    depth = cv2.GaussianBlur(cv2.subtract(close_dots(image), image).max(2), (0, 0), 1)
     _, _, stats, _ = cv2.connectedComponentsWithStats((depth > DOT_DEPTH).astype(np.uint8))
     # the first component is the ground
     _, _, width, height, area = stats[1:].T
@@ -70,7 +73,7 @@ def has_dots(picture: np.ndarray) -> bool:
 
 
 def difference_image(frame: np.ndarray, background: np.ndarray, blur: float = BLUR) -> np.ndarray:
-    """Return the colour difference of two pictures, without light, tint and noise.
+    """Return the colour difference of two images, without light, tint and noise.
 
     Args:
         frame: u8 (h, w, 3).
@@ -89,7 +92,7 @@ def difference_image(frame: np.ndarray, background: np.ndarray, blur: float = BL
 def change_of_light(change: np.ndarray) -> np.ndarray:
     """Return the part of a change f32 (h, w, 3) that lamps make: a plane for each colour.
 
-    Lamps drift, and all of the picture with them. A press covers little of it, so the plane is
+    Lamps drift, and all of the image with them. A press covers little of it, so the plane is
     fitted again and again to those 60 % of the cells that it fits best (least trimmed squares).
     """
     small = cv2.resize(change, (FIT, FIT), interpolation=cv2.INTER_AREA).reshape(-1, 3)
@@ -106,16 +109,16 @@ def change_of_light(change: np.ndarray) -> np.ndarray:
     return np.asarray((plane[0] + y * plane[2])[:, None] + x * plane[1], np.float32)
 
 
-class UntouchedGel:
+class UntouchedBackground:
     """A background u8 (h, w, 3), which scores frames.
 
     Dots are closed only on a gel that has some, because closing takes small contacts away too.
     """
 
-    def __init__(self, picture: np.ndarray) -> None:
-        self.picture = scale_picture(picture)
-        self.has_dots = has_dots(self.picture)
-        self._compared = close_dots(self.picture) if self.has_dots else self.picture
+    def __init__(self, image: np.ndarray) -> None:
+        self.image = scale_image(image)
+        self.has_dots = has_dots(self.image)
+        self._compared = close_dots(self.image) if self.has_dots else self.image
 
     def score(self, frame: np.ndarray) -> float:
         """Return the difference, 0 to 255, of a frame u8 (h, w, 3) from the gel.
@@ -129,87 +132,89 @@ class UntouchedGel:
 
         Raises ValueError as `score`.
         """
-        frame = scale_picture(frame)
-        sides = zip(frame.shape, self.picture.shape, strict=True)
+        frame = scale_image(frame)
+        sides = zip(frame.shape, self.image.shape, strict=True)
         if max(abs(a - b) for a, b in sides) > 2:
             raise ValueError("its background has other proportions")
         if min(frame.shape[:2]) <= 2 * EDGE:
             raise ValueError("it is too thin a strip")
-        if frame.shape != self.picture.shape:
-            frame = cv2.resize(frame, self.picture.shape[1::-1])
+        if frame.shape != self.image.shape:
+            frame = cv2.resize(frame, self.image.shape[1::-1])
         if self.has_dots:
             frame = close_dots(frame)
         return difference_image(frame, self._compared)
 
 
-def estimate_untouched_gel(pictures: Sequence[np.ndarray]) -> tuple[UntouchedGel | None, str]:
+def estimate_background_image(
+    images: Sequence[np.ndarray],
+) -> tuple[UntouchedBackground | None, str]:
     """Return the background of scaled frames u8 (h, w, 3) of one recording, and the reason.
 
     It is None if the frames do not show it.
     """
-    group, reason = free_frames(pictures)
+    group, reason = free_frames(images)
     if group is None:
         return None, reason
-    return UntouchedGel(_median([pictures[i] for i in group])), "estimated"
+    return UntouchedBackground(_median([images[i] for i in group])), "estimated"
 
 
-def free_frames(pictures: Sequence[np.ndarray]) -> tuple[np.ndarray | None, str]:
+def free_frames(images: Sequence[np.ndarray]) -> tuple[np.ndarray | None, str]:
     """Return the numbers of the frames that show the untouched gel, or None and the reason.
 
-    `pictures` are scaled frames u8 (h, w, 3) of one recording.
+    `images` are scaled frames u8 (h, w, 3) of one recording.
     """
     reason = ""
     # Dots are structure, and move with shear. Whether the gel has some is known only once the free
     # frames are found, so both are tried, and the answer must agree with what was assumed.
     for marked in (False, True):
-        frames = [close_dots(picture) for picture in pictures] if marked else list(pictures)
+        frames = [close_dots(image) for image in images] if marked else list(images)
         group, reason = _least_structured_group(frames)
         if group is None:
             continue
-        if has_dots(_median([pictures[i] for i in group])) == marked:
+        if has_dots(_median([images[i] for i in group])) == marked:
             return group, ""
         reason = "free and pressed gel look alike"
     return None, reason
 
 
-def median_gel(pictures: Sequence[np.ndarray]) -> UntouchedGel | None:
+def median_background(images: Sequence[np.ndarray]) -> UntouchedBackground | None:
     """Return the median of frames of one sensor instance, if it shows the untouched gel.
 
     It is None if it shows a press, or if all frames are alike and may be pressed.
     """
-    if not len(pictures):
+    if not len(images):
         return None
-    free = _median(pictures)
-    others = [picture for picture in pictures if _distance(free, picture) >= DIFFERENT]
+    free = _median(images)
+    others = [image for image in images if _distance(free, image) >= DIFFERENT]
     if not others or np.median([_press_of(free, other) for other in others]) >= ALIKE:
         return None
-    return UntouchedGel(free)
+    return UntouchedBackground(free)
 
 
-def gel_of_unit(gels: Sequence[UntouchedGel]) -> UntouchedGel | None:
+def background_of_unit(backgrounds: Sequence[UntouchedBackground]) -> UntouchedBackground | None:
     """Return the background that most estimates of one sensor instance agree on.
 
     It is None if fewer than two do, or as many on another.
     """
-    if len(gels) < 2:
+    if len(backgrounds) < 2:
         return None
-    groups = _alike([gel.score(other.picture) for gel, other in combinations(gels, 2)])
+    groups = _alike([gel.score(other.image) for gel, other in combinations(backgrounds, 2)])
     groups.sort(key=len, reverse=True)
     first = groups[0]
     if len(first) < 2:
         return None
-    centre = UntouchedGel(_median([gels[i].picture for i in first]))
+    centre = UntouchedBackground(_median([backgrounds[i].image for i in first]))
     for group in groups[1:]:
         if len(group) < len(first):
             continue
-        rival = UntouchedGel(_median([gels[i].picture for i in group]))
-        if centre.score(rival.picture) >= ALIKE:
+        rival = UntouchedBackground(_median([backgrounds[i].image for i in group]))
+        if centre.score(rival.image) >= ALIKE:
             return None
     return centre
 
 
-def _median(pictures: Sequence[np.ndarray]) -> np.ndarray:
-    return np.asarray(np.median(pictures, axis=0)).astype(np.uint8)
+def _median(images: Sequence[np.ndarray]) -> np.ndarray:
+    return np.asarray(np.median(images, axis=0)).astype(np.uint8)
 
 
 def _alike(distances: Sequence[float]) -> list[np.ndarray]:
@@ -277,6 +282,30 @@ def _distance(frame: np.ndarray, other: np.ndarray, blur: float = BLUR) -> float
     return contact_score(difference_image(frame, other, blur), round(EDGE * blur / BLUR))
 
 
+def without_islands(mask: np.ndarray) -> np.ndarray:
+    """Return a mask of contact u8 or bool (h, w) without what is noise to the eye.
+
+    The largest part stays. Others go if they are less than a tenth of it and lie at the border,
+    where gels curl and lenses blur, or if they are specks.
+    """
+    count, labels, about, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
+    if count <= 2:
+        return mask
+    area = about[:, cv2.CC_STAT_AREA].astype(np.float64)
+    area[0] = 0.0  # what is not contact
+    left = about[:, cv2.CC_STAT_LEFT]
+    top = about[:, cv2.CC_STAT_TOP]
+    right = left + about[:, cv2.CC_STAT_WIDTH]
+    bottom = top + about[:, cv2.CC_STAT_HEIGHT]
+    height, width = mask.shape
+    at_border = (left == 0) | (top == 0) | (right == width) | (bottom == height)
+    small = area < _ISLAND * area.max()
+    keep = ~(small & at_border) & (area >= _SPECK * mask.size)
+    keep[int(np.argmax(area))] = True
+    keep[0] = False
+    return keep[labels].astype(mask.dtype)
+
+
 def contact_score(difference: np.ndarray, edge: int = EDGE) -> float:
     """Return the contact score of a difference image (h, w), without its edges.
 
@@ -294,9 +323,9 @@ def _excess_structure(free: np.ndarray, pressed: np.ndarray) -> float:
     return (more - less) / (more + less + 1e-6)
 
 
-def _edges(picture: np.ndarray, region: np.ndarray) -> float:
+def _edges(image: np.ndarray, region: np.ndarray) -> float:
     """Return the sum of the strengths of the edges in a region bool (h, w)."""
-    gradient = _gradient(_smooth(picture))[region]
+    gradient = _gradient(_smooth(image))[region]
     return float(np.sqrt((gradient**2).sum(1)).sum())
 
 
@@ -304,8 +333,8 @@ def _press_of(free: np.ndarray, pressed: np.ndarray) -> float:
     """Return the score of the press that `free` shows itself.
 
     A press that gets deeper strengthens edges that are there already. Edges of the untouched gel
-    are others. So the share of the change that is along the edges of `free` (a projection), times
-    the score of the change, is what was there before.
+    are others. So the fraction of the change that is along the edges of `free` (a projection),
+    times the score of the change, is what was there before.
     """
     region = _changed(free, pressed)
     before = _gradient(_smooth(free) - _smooth(free, WIDE))[region]
@@ -316,17 +345,17 @@ def _press_of(free: np.ndarray, pressed: np.ndarray) -> float:
 
 
 def _changed(free: np.ndarray, pressed: np.ndarray) -> np.ndarray:
-    """Return where two pictures differ, bool (h, w)."""
+    """Return where two images differ, bool (h, w)."""
     change = difference_image(free, pressed)
     region = change > max(0.35 * float(np.percentile(change, 99)), 1.0)
     return np.asarray(cv2.dilate(region.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0)
 
 
-def _smooth(picture: np.ndarray, blur: float = BLUR) -> np.ndarray:
-    return np.asarray(cv2.GaussianBlur(picture.astype(np.float32), (0, 0), blur))
+def _smooth(image: np.ndarray, blur: float = BLUR) -> np.ndarray:
+    return np.asarray(cv2.GaussianBlur(image.astype(np.float32), (0, 0), blur))
 
 
-def _gradient(picture: np.ndarray) -> np.ndarray:
+def _gradient(image: np.ndarray) -> np.ndarray:
     """Return the colour gradient, f32 (h, w, 6)."""
-    sides = [cv2.Sobel(picture, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=0.125) for dx in (1, 0)]
+    sides = [cv2.Sobel(image, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=0.125) for dx in (1, 0)]
     return np.concatenate(sides, axis=2)

@@ -1,7 +1,7 @@
-"""Layout of a camera's picture: is it turned, mirrored, or with red and blue exchanged?
+"""Layout of a camera's image: is it turned, mirrored, or with red and blue exchanged?
 
-A background is compared with those of real sensor instances of the same family. `gels.npz` has some
-of these, at 30 x 40 pixels. The simulator draws with the same pictures.
+A background is compared with those of real sensor instances of the same family. `backgrounds.npz`
+has some of these, at 30 x 40 pixels. The simulator draws with the same images.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from anytouch_jax.data.background.estimate import close_dots, has_dots, scale_picture
+from anytouch_jax.data.background.estimate import close_dots, has_dots, scale_image
 from anytouch_jax.files import read_arrays
 
 Array = npt.NDArray[Any]
-SIDE = 16  # of the layout of a picture
-# A picture must fit better by so much another way round before it is called turned. Layouts have
+SIDE = 16  # of the layout of an image
+# An image must fit better by so much another way round before it is called turned. Layouts have
 # norm 1, so this is a difference of correlations.
 ORIENTATION = 0.10
 _LIKE = 0.6  # least correlation with the family
@@ -48,7 +48,7 @@ _TURNS = (
     Turn(2, True),
     Turn(3, True),
 )
-# What was done to a picture, in words, and the option that undoes it.
+# What was done to an image, in words, and the option that undoes it.
 _NAMES = {
     Turn(1, False): "turned by 90 degrees",
     Turn(2, False): "upside down",
@@ -91,7 +91,7 @@ class UnitFrames:
     Attributes:
         sensor: Its family.
         unit: Its name.
-        recordings: Lists of pictures RGB u8 (h, w, 3), in order, all of one size.
+        recordings: Lists of images RGB u8 (h, w, 3), in order, all of one size.
         background: Its untouched gel.
         steps: (n,), distances of neighbouring frame numbers.
         rows: Number of all its frames, read or not.
@@ -106,19 +106,19 @@ class UnitFrames:
 
     @property
     def frames(self) -> list[Array]:
-        """All pictures that were read."""
+        """All images that were read."""
         return [frame for recording in self.recordings for frame in recording]
 
     @cached_property
     def small(self) -> list[Array]:
-        """The pictures of each recording at 160 pixels, u8 (n, h, w, 3)."""
+        """The images of each recording at 160 pixels, u8 (n, h, w, 3)."""
         return [
-            np.stack([scale_picture(frame) for frame in recording]) for recording in self.recordings
+            np.stack([scale_image(frame) for frame in recording]) for recording in self.recordings
         ]
 
     @cached_property
     def middles(self) -> list[Array]:
-        """The median picture of each recording at 160 pixels."""
+        """The median image of each recording at 160 pixels."""
         return [np.median(small, axis=0).astype(np.uint8) for small in self.small]
 
     @cached_property
@@ -127,21 +127,21 @@ class UnitFrames:
         return np.median(np.stack(self.middles), axis=0).astype(np.uint8)
 
     def untouched(self) -> Array:
-        """Return the background, or the usual picture without one."""
+        """Return the background, or the usual image without one."""
         if self.background is None:
             return self.usual
         return self.background
 
 
 @lru_cache
-def known_gels(sensor: str) -> list[Array]:
+def known_backgrounds(sensor: str) -> list[Array]:
     """Return backgrounds RGB u8 (30, 40, 3) of real instances of a sensor family.
 
     There are none of an unknown family, and of those whose look the simulator invents.
     """
-    with (files("anytouch_jax.data.background") / "gels.npz").open("rb") as file:
-        gels = read_arrays(file, only=sensor.__eq__)
-    return list(gels.get(sensor, ()))
+    with (files("anytouch_jax.data.background") / "backgrounds.npz").open("rb") as file:
+        backgrounds = read_arrays(file, only=sensor.__eq__)
+    return list(backgrounds.get(sensor, ()))
 
 
 def check_layout(
@@ -149,11 +149,11 @@ def check_layout(
 ) -> Check:
     """Compare with the references: which turn and order of colours fits them best?
 
-    A near symmetry is no fault: where a picture fits another way round by little more, nothing is
+    A near symmetry is no fault: where an image fits another way round by little more, nothing is
     said.
 
     Args:
-        unit: Its background, or else its usual picture, is compared.
+        unit: Its background, or else its usual image, is compared.
         references: Backgrounds u8 (h, w, 3) of the same family.
         may_be_turned: No turn is a fault, and no mirror image; exchanged colours still are.
     """
@@ -183,15 +183,15 @@ def check_layout(
     return Check(name, False, value, f"Read it with {' and '.join(cure + exchanged)}.")
 
 
-def _scores(picture: Array, references: Sequence[Array]) -> dict[tuple[Turn, bool], float]:
-    """Return how well a picture fits the references, for each turn and order of its colours.
+def _scores(image: Array, references: Sequence[Array]) -> dict[tuple[Turn, bool], float]:
+    """Return how well an image fits the references, for each turn and order of its colours.
 
     Turns that give it other proportions are left out.
     """
     known = np.stack([_layout(reference) for reference in references])
-    own = _layout(picture)
+    own = _layout(image)
     shapes = np.log([reference.shape[1] / reference.shape[0] for reference in references])
-    shape = np.log(picture.shape[1] / picture.shape[0])
+    shape = np.log(image.shape[1] / image.shape[0])
     scores = {}
     for turn, is_exchanged in product(_TURNS, (False, True)):
         turned_shape = -shape if turn.quarters % 2 else shape
@@ -203,7 +203,7 @@ def _scores(picture: Array, references: Sequence[Array]) -> dict[tuple[Turn, boo
 
 
 def _inverse(turn: Turn) -> Turn:
-    """Return what was done to a picture that `turn` makes fit.
+    """Return what was done to an image that `turn` makes fit.
 
     A mirror image that is turned is its own inverse.
     """
@@ -212,12 +212,12 @@ def _inverse(turn: Turn) -> Turn:
     return Turn(-turn.quarters % 4, False)
 
 
-def _layout(picture: Array) -> Array:
-    """Return where a picture has which colour, f32 (SIDE, SIDE, 3) of norm 1.
+def _layout(image: Array) -> Array:
+    """Return where an image has which colour, f32 (SIDE, SIDE, 3) of norm 1.
 
     Brightness and contrast are gone, because exposure and gain change them.
     """
-    small = small_look(np.ascontiguousarray(picture)).reshape(SIDE, SIDE, 3)
+    small = small_look(np.ascontiguousarray(image)).reshape(SIDE, SIDE, 3)
     small = small - small.mean()
     return np.asarray(small / max(float(np.linalg.norm(small)), 1e-6))
 
@@ -231,9 +231,9 @@ def _turned(layout: Array, turn: Turn, is_exchanged: bool) -> Array:
     return layout
 
 
-def small_look(picture: Array) -> Array:
-    """Return a picture without its dots at SIDE pixels, f32 (SIDE * SIDE * 3,)."""
-    small = scale_picture(picture)
+def small_look(image: Array) -> Array:
+    """Return an image without its dots at SIDE pixels, f32 (SIDE * SIDE * 3,)."""
+    small = scale_image(image)
     if has_dots(small):
         small = close_dots(small)
     return cv2.resize(small, (SIDE, SIDE), interpolation=cv2.INTER_AREA).astype(np.float32).ravel()

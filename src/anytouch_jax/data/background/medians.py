@@ -10,7 +10,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from anytouch_jax.data.background.estimate import EDGE, free_frames, scale_picture
+from anytouch_jax.data.background.estimate import EDGE, free_frames, scale_image
 from anytouch_jax.data.pixels import to_rgb
 from anytouch_jax.errors import UserError
 
@@ -58,7 +58,7 @@ def estimate_background(frames: Iterable[npt.ArrayLike]) -> Array:
         spread.add(frame)
     if spread.count < FEWEST:
         raise UserError(
-            f"{spread.count} frames are too few for a picture of the untouched gel. Give {FEWEST} "
+            f"{spread.count} frames are too few for an image of the untouched gel. Give {FEWEST} "
             "or more."
         )
     shapes = {frame.shape for frame in spread.items}
@@ -88,7 +88,7 @@ def estimate(frames: Sequence[Array]) -> Array:
     that is held for most of a recording would be in the median of all.
     """
     some = [frames[i] for i in evenly(len(frames), _ESTIMATED)]
-    small = [scale_picture(frame) for frame in some]
+    small = [scale_image(frame) for frame in some]
     # the score leaves out a border of EDGE pixels
     is_large_enough = min(small[0].shape[:2]) > 2 * EDGE + 2
     if len(some) < FEWEST or not is_large_enough:
@@ -103,7 +103,7 @@ def reduced(frame: Array) -> Array:
     """Return a copy of a frame, whose long side has at most SIDE pixels."""
     if max(frame.shape[:2]) <= SIDE:
         return frame.copy()
-    return scale_picture(frame, SIDE)
+    return scale_image(frame, SIDE)
 
 
 def recording_gel(frames: Iterable[Array]) -> tuple[Array, int]:
@@ -115,9 +115,7 @@ def recording_gel(frames: Iterable[Array]) -> tuple[Array, int]:
     for frame in frames:
         spread.add(frame)
     if not spread.items:
-        raise UserError(
-            "no frame can be read, so the untouched gel is unknown. Check the pictures."
-        )
+        raise UserError("no frame can be read, so the untouched gel is unknown. Check the images.")
     usual = alike(spread.items)
     return estimate(usual), len(usual)
 
@@ -128,17 +126,17 @@ def alike(frames: Sequence[Array]) -> list[Array]:
     return [frame for frame in frames if frame.shape == sizes.most_common(1)[0][0]]
 
 
-class RunningGel:
-    """The background of a live source: `picture`, None before its first frame.
+class RunningBackground:
+    """The background of a live source: `image`, None before its first frame.
 
     A thread estimates it from the frames so far whenever their number has doubled. The result
     counts when the number has doubled again, not when the thread is done. So no frame waits for it,
-    and the same frames have the same pictures on a slow machine and on a fast one. It is `settled`
+    and the same frames have the same images on a slow machine and on a fast one. It is `settled`
     after SETTLED frames.
     """
 
     def __init__(self) -> None:
-        self.picture: Array | None = None
+        self.image: Array | None = None
         self.settled = False
         self._spread: Spread[Array] = Spread(reduced)
         self._thread: threading.Thread | None = None
@@ -161,9 +159,9 @@ class RunningGel:
         frames = alike(self._spread.items)
         self.settled = count >= SETTLED
         if self._found:
-            self.picture = self._found.pop()
-        elif self.picture is None:
-            self.picture = frames[0]
+            self.image = self._found.pop()
+        elif self.image is None:
+            self.image = frames[0]
         if not self.settled:
             self._thread = threading.Thread(
                 target=lambda: self._found.append(estimate(frames)), daemon=True

@@ -10,30 +10,30 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from anytouch_jax.data.background.estimate import DIFFERENT, UntouchedGel
+from anytouch_jax.data.background.estimate import DIFFERENT, UntouchedBackground
 
 Array = npt.NDArray[Any]
 # grey levels: frames of one unit differ by less in most places, units of one product by more
 TINT = 8.0
-_SAME_SHAPE = 0.05  # relative difference of the proportions of one camera's pictures
+_SAME_SHAPE = 0.05  # relative difference of the proportions of one camera's images
 
 
 def same_unit(
-    known: Mapping[str, Array], picture: Array, *, untouched: bool = False
+    known: Mapping[str, Array], image: Array, *, untouched: bool = False
 ) -> tuple[Array | None, str]:
-    """Return the known picture that looks most like `picture`, and how it differs.
+    """Return the known image that looks most like `image`, and how it differs.
 
     Args:
         known: Backgrounds by the name of their sensor instance, u8 (h, w, 3).
-        picture: The background of the camera at hand.
-        untouched: Nothing presses in `picture` for sure. Then it must not count as pressed when the
-            known picture is subtracted, which two instances of one tint can look like.
+        image: The background of the camera at hand.
+        untouched: Nothing presses in `image` for sure. Then it must not count as pressed when the
+            known image is subtracted, which two instances of one tint can look like.
 
     Returns:
-        The picture, None without any of these proportions, and why the camera is another instance:
+        The image, None without any of these proportions, and why the camera is another instance:
         "" if it is the same one, else words such as "in size".
     """
-    shape = picture.shape[1] / picture.shape[0]
+    shape = image.shape[1] / image.shape[0]
     fitting = {}
     for name, gel in known.items():
         ratio = gel.shape[1] / gel.shape[0] / shape
@@ -41,8 +41,8 @@ def same_unit(
             fitting[name] = gel
     if not fitting:
         return None, "in size" if known else ""
-    # A median over places: a press, or a speck, is in the smaller part of the picture.
-    own = _thumbnail(picture)
+    # A median over places: a press, or a speck, is in the smaller part of the image.
+    own = _thumbnail(image)
     tints = {
         name: float(np.median(np.abs(_thumbnail(gel) - own), axis=(0, 1)).max())
         for name, gel in fitting.items()
@@ -54,26 +54,26 @@ def same_unit(
     if untouched:
         # proportions that differ by a few pixels cannot be compared, and say nothing
         with suppress(ValueError):
-            score = UntouchedGel(gel).score(picture)
+            score = UntouchedBackground(gel).score(image)
             if score >= DIFFERENT:
                 return gel, f"as much as a touch does, by a contact score of {score:.0f}"
     return gel, ""
 
 
-def _thumbnail(picture: Array) -> Array:
-    return cv2.resize(picture, (32, 24), interpolation=cv2.INTER_AREA).astype(np.float32)
+def _thumbnail(image: Array) -> Array:
+    return cv2.resize(image, (32, 24), interpolation=cv2.INTER_AREA).astype(np.float32)
 
 
 class Recognised(NamedTuple):
-    """What the known pictures of a head or an index say about a camera.
+    """What the known images of a head or an index say about a camera.
 
     Attributes:
-        picture: The one that is subtracted, None if the camera's own counts.
+        image: The one that is subtracted, None if the camera's own counts.
         what: What it is, in words for the report.
         warning: A sentence, "" if all is well.
     """
 
-    picture: Array | None
+    image: Array | None
     what: str
     warning: str
 
@@ -86,28 +86,28 @@ def recognise(
     untouched: bool = False,
     of: str = "the head was fitted with",
 ) -> Recognised:
-    """Return which of the known pictures counts for a camera.
+    """Return which of the known images counts for a camera.
 
     Args:
         known: Backgrounds by the name of their sensor instance.
         own: What the camera shows.
         is_background: Whether `own` can be subtracted. A few frames show the press itself. That
             changes the tint by up to 17 grey levels on real sensors, as much as another instance
-            does, so they cannot tell the two apart. Then the nearest picture is better than none.
+            does, so they cannot tell the two apart. Then the nearest image is better than none.
         untouched: Nothing presses in `own` for sure.
-        of: What the known pictures belong to, in words.
+        of: What the known images belong to, in words.
     """
     gel, why = same_unit(known, own, untouched=untouched)
     if gel is not None and not why:
-        return Recognised(gel, f"the picture that {of}", "")
+        return Recognised(gel, f"the image that {of}", "")
     if is_background:
         return Recognised(None, "", other_unit(why) if why else "")
     if gel is None:
         return Recognised(None, "", "")
     return Recognised(
         gel,
-        f"the nearest picture that {of}. So few frames do not tell whether it is the same sensor: "
-        "name its own picture with --background if it is another",
+        f"the nearest image that {of}. So few frames do not tell whether it is the same sensor: "
+        "name its own image with --background if it is another",
         "",
     )
 
@@ -115,6 +115,6 @@ def recognise(
 def other_unit(why: str) -> str:
     """Return the warning about a camera that differs from all that something was fitted with."""
     return (
-        f"The picture differs {why} from every unit that the head or index was fitted with. Its "
+        f"The image differs {why} from every unit that the head or index was fitted with. Its "
         "own untouched gel is subtracted. Do not trust the result before you have checked it."
     )

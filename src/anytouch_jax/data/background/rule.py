@@ -1,10 +1,10 @@
 """The background image (the untouched gel): one rule for every reader of frames.
 
-Manifests, folders, videos, pictures and live sources all ask here. The first of these counts:
+Manifests, folders, videos, images and live sources all ask here. The first of these counts:
 
-* the picture that the user names
-* the picture of the same sensor instance that a head or an index was fitted with
-* a stored picture: `background_path`, rows of split `background`, background.png of a folder
+* the image that the user names
+* the image of the same sensor instance that a head or an index was fitted with
+* a stored image: `background_path`, rows of split `background`, background.png of a folder
 * the median of the instance's frames
 * for a live source, a running estimate
 
@@ -32,7 +32,7 @@ from anytouch_jax.data.background.medians import (
     FRAMES,
     SETTLED,
     SIDE,
-    RunningGel,
+    RunningBackground,
     Spread,
     alike,
     estimate,
@@ -64,16 +64,16 @@ __all__ = [
     "SIDE",
     "STORED",
     "TINT",
+    "Backgrounds",
     "Recognised",
-    "RunningGel",
+    "RunningBackground",
     "Spread",
-    "UnitGels",
     "alike",
     "as_taken",
+    "background_arrays",
+    "backgrounds_of_arrays",
     "estimate",
     "estimate_background",
-    "gel_arrays",
-    "gels_of_arrays",
     "median",
     "other_unit",
     "recognise",
@@ -84,43 +84,43 @@ __all__ = [
 
 Array = npt.NDArray[Any]
 T = TypeVar("T")
-STORED = 32  # units whose pictures a file stores
+STORED = 32  # units whose images a file stores
 ADVICE = (
-    f"Record {FEWEST} frames or more of the sensor, or name a picture of its gel in the column "
+    f"Record {FEWEST} frames or more of the sensor, or name an image of its gel in the column "
     "background_path."
 )
 _FREE_ROWS = "rows of split background"
 
 
-def as_taken(picture: Array, rotate: int, flip: Flip) -> Array:
-    """Return an upright picture as the camera takes it, the inverse of `orient_frame`."""
-    return np.ascontiguousarray(orient_frame(orient_frame(picture, 0, flip), -rotate % 360))
+def as_taken(image: Array, rotate: int, flip: Flip) -> Array:
+    """Return an upright image as the camera takes it, the inverse of `orient_frame`."""
+    return np.ascontiguousarray(orient_frame(orient_frame(image, 0, flip), -rotate % 360))
 
 
 class _Unit(NamedTuple):
     """The background of a sensor instance.
 
     Attributes:
-        picture: u8 (h, w, 3), None if there is none.
+        image: u8 (h, w, 3), None if there is none.
         source: What it is, in words for the report.
         frames: From how many frames it is, 0 if it is stored.
         fitted: Whether a head or an index has it.
     """
 
-    picture: Array | None = None
+    image: Array | None = None
     source: str = "none"
     frames: int = 0
     fitted: bool = False
 
 
-class UnitGels:
+class Backgrounds:
     """The background of every row of a manifest.
 
     An instance is looked at when one of its rows is asked for.
 
     Args:
         manifest: The frames.
-        known: The pictures of a head or an index by instance, of which the same instance gets its
+        known: The images of a head or an index by instance, of which the same instance gets its
             own: what is computed must be the same as when it was fitted.
         log: Gets one warning about instances that are none of these.
     """
@@ -146,20 +146,20 @@ class UnitGels:
         self._lock = threading.Lock()
 
     def __call__(self, row: int) -> Array | None:
-        """Return the picture RGB u8 (h, w, 3) of a row's instance.
+        """Return the image RGB u8 (h, w, 3) of a row's instance.
 
-        It is None if the stored picture of the row counts, or if there is none.
+        It is None if the stored image of the row counts, or if there is none.
         """
-        return self._of(row).picture
+        return self._of(row).image
 
     def read(self, row: int) -> Array | None:
-        """Return the background of a row, its stored picture where that counts.
+        """Return the background of a row, its stored image where that counts.
 
         Raises UserError if that is broken.
         """
-        picture = self(row)
-        if picture is not None or not self._stored[row]:
-            return picture
+        image = self(row)
+        if image is not None or not self._stored[row]:
+            return image
         try:
             return decode(self._manifest.file(row, "background_path"))
         except UserError as error:
@@ -170,21 +170,21 @@ class UnitGels:
     def shared(self, make: Callable[[Array], T], most: int = 256) -> Callable[[int], T | None]:
         """Return a function from a row to `make` of its background, or to None without one.
 
-        `make` is called once for all rows that share a picture. At most `most` results are kept,
-        because a data set may have a picture for each row.
+        `make` is called once for all rows that share an image. At most `most` results are kept,
+        because a data set may have an image for each row.
         """
         made = dict[Any, T]()
 
         def of_row(row: int) -> T | None:
-            # A stored picture is known by its file, and the picture of an instance by its number.
+            # A stored image is known by its file, and the image of an instance by its number.
             key: Any = int(self._unit[row])
             if self(row) is None:
                 key = self._manifest.file(row, "background_path") if self._stored[row] else None
             if key is None or key in made:
                 return made.get(key)
-            picture = self.read(row)
-            assert picture is not None
-            one = make(picture)
+            image = self.read(row)
+            assert image is not None
+            one = make(image)
             if len(made) >= most:
                 made.clear()
             # another thread may have made it meanwhile
@@ -216,16 +216,16 @@ class UnitGels:
             parts.append(f"{source}{about} for {count:,} rows")
         return f"untouched gel: {'; '.join(parts)}"
 
-    def pictures(self, rows: Array) -> dict[str, Array]:
-        """Return the pictures of the instances of rows by name, for the STORED most frequent."""
+    def images(self, rows: Array) -> dict[str, Array]:
+        """Return the images of the instances of rows by name, for the STORED most frequent."""
         rows = rows[self.has(rows)]
         units, first, counts = np.unique(self._unit[rows], return_index=True, return_counts=True)
         most_frequent = np.argsort(-counts, kind="stable")[:STORED]
         found = {}
         for place in most_frequent.tolist():
-            picture = self.read(int(rows[first[place]]))
-            assert picture is not None
-            found[self._name(int(units[place]))] = reduced(picture)
+            image = self.read(int(rows[first[place]]))
+            assert image is not None
+            found[self._name(int(units[place]))] = reduced(image)
         return found
 
     def _name(self, unit: int) -> str:
@@ -234,15 +234,15 @@ class UnitGels:
         return " ".join(str(cell) for cell in cells if cell)
 
     def digest(self) -> str:
-        """Return what decides the pictures that are not stored ones, as text.
+        """Return what decides the images that are not stored ones, as text.
 
-        A cache of features has it in its key. Stored pictures are in the manifest's own digest.
+        A cache of features has it in its key. Stored images are in the manifest's own digest.
         """
         digest = 0
         asked = np.unique(self._first[self._unit[~self._stored]])
         for row in asked:
-            picture = self._find_once(int(self._unit[row])).picture
-            content = b"-" if picture is None else picture.tobytes()
+            image = self._find_once(int(self._unit[row])).image
+            content = b"-" if image is None else image.tobytes()
             digest = zlib.crc32(content, digest)
         return f"{digest:08x}"
 
@@ -250,12 +250,12 @@ class UnitGels:
         """Return what counts for a row."""
         if not self._stored[row]:
             return self._find_once(int(self._unit[row]))
-        # A stored picture comes after one that a head was fitted with.
+        # A stored image comes after one that a head was fitted with.
         if self._known:
             one = self._find_once(int(self._unit[row]))
             if one.fitted:
                 return one
-        return _Unit(None, "a stored picture")
+        return _Unit(None, "a stored image")
 
     def _find_once(self, unit: int) -> _Unit:
         with self._lock:
@@ -264,11 +264,11 @@ class UnitGels:
             return self._units[unit]
 
     def _find(self, unit: int) -> _Unit:
-        """Return the picture of the same instance among the known ones, or else the median."""
+        """Return the image of the same instance among the known ones, or else the median."""
         rows = np.flatnonzero((self._unit == unit) & self._has_image)
         free = rows[self._split[rows] == "background"]
         found = self._median(free, 1, _FREE_ROWS)
-        if found.picture is None:
+        if found.image is None:
             found = self._median_of(unit, self._fitted(rows))
         if not self._known:
             return found
@@ -278,29 +278,29 @@ class UnitGels:
         name = self._name(unit)
         known = {name: self._known[name]} if name in self._known else self._known
         counts = recognise(
-            known, own, is_background=untouched or found.picture is not None, untouched=untouched
+            known, own, is_background=untouched or found.image is not None, untouched=untouched
         )
         if counts.warning and self._log is not None:
             self._log(counts.warning)
             self._log = None  # once
-        if counts.picture is None:
+        if counts.image is None:
             return found
-        return _Unit(counts.picture, counts.what, 0, True)
+        return _Unit(counts.image, counts.what, 0, True)
 
     def _own(self, rows: Array, found: _Unit) -> tuple[Array | None, bool]:
         """Return what tells an instance, and whether nothing presses in it for sure.
 
-        That is a picture of its untouched gel, else its median, else its few frames.
+        That is an image of its untouched gel, else its median, else its few frames.
         """
         if found.source == _FREE_ROWS:
-            return found.picture, True
+            return found.image, True
         for row in rows[self._stored[rows]][:1].tolist():
             # a broken one is reported when the row itself is read
             with suppress(UserError):
                 return reduced(decode(self._manifest.file(row, "background_path"))), True
-        if found.picture is not None:
-            return found.picture, False
-        return self._median(rows, 1, "").picture, False
+        if found.image is not None:
+            return found.image, False
+        return self._median(rows, 1, "").image, False
 
     def _median_of(self, unit: int, rows: Array) -> _Unit:
         """Return the median of rows of an instance, or that of its sensor.
@@ -313,17 +313,17 @@ class UnitGels:
         sensor = int(sensors[self._first[unit]])
         everything = self._fitted(np.flatnonzero((sensors == sensor) & self._has_image))
         sequences = np.unique(self._manifest.codes("sequence", own=True)[rows])
-        is_enough = own.picture is not None and len(sequences) >= FEWEST
+        is_enough = own.image is not None and len(sequences) >= FEWEST
         if is_enough or len(everything) == len(rows):
             return own
         if sensor not in self._sensors:
             self._sensors[sensor] = self._median(everything, FEWEST, "the median of its sensor")
         shared = self._sensors[sensor]
-        if own.picture is None:
+        if own.image is None:
             return shared
-        if shared.picture is None:
+        if shared.image is None:
             return own
-        _, differs = same_unit({"": shared.picture}, own.picture)
+        _, differs = same_unit({"": shared.image}, own.image)
         if differs:
             return own
         return shared
@@ -349,18 +349,18 @@ class UnitGels:
         return _Unit(median(usual), source, len(usual))
 
 
-def gel_arrays(pictures: Mapping[str, Array]) -> dict[str, Array]:
-    """Return pictures by instance as arrays for an .npz file."""
-    if not pictures:
+def background_arrays(images: Mapping[str, Array]) -> dict[str, Array]:
+    """Return images by instance as arrays for an .npz file."""
+    if not images:
         return {}
-    arrays = {"gels": np.array(list(pictures), str)}
-    for number, picture in enumerate(pictures.values()):
-        arrays[f"gel/{number}"] = picture
+    arrays = {"gels": np.array(list(images), str)}
+    for number, image in enumerate(images.values()):
+        arrays[f"gel/{number}"] = image
     return arrays
 
 
-def gels_of_arrays(arrays: Mapping[str, Array]) -> dict[str, Array]:
-    """Return the pictures among the arrays of an .npz file.
+def backgrounds_of_arrays(arrays: Mapping[str, Array]) -> dict[str, Array]:
+    """Return the images among the arrays of an .npz file.
 
     Raises KeyError or ValueError for others.
     """
@@ -368,7 +368,7 @@ def gels_of_arrays(arrays: Mapping[str, Array]) -> dict[str, Array]:
     check_array("gels", names, (len(names.reshape(-1)),), "U")
     found = {}
     for number, name in enumerate(names.tolist()):
-        picture = arrays[f"gel/{number}"]
-        check_array(f"gel/{number}", picture, (*picture.shape[:2], 3), "u")
-        found[name] = picture
+        image = arrays[f"gel/{number}"]
+        check_array(f"gel/{number}", image, (*image.shape[:2], 3), "u")
+        found[name] = image
     return found

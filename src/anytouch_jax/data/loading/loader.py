@@ -117,20 +117,20 @@ class Loader(BatchSource):
         self._reader = SampleReader(manifest, config)
         self._log = log
         self._replaced = set[str]()
-        pools = find_pools(manifest, config, tokenizer, devices, self._reader.gels)
+        pools = find_pools(manifest, config, tokenizer, devices, self._reader.backgrounds)
         self._pools = pools.touch
         self._match_pools = pools.match
         self._sensor = pools.sensor
         self.tokenizer = pools.tokenizer
         self.notes = pools.notes
         # Batches are drawn from these pools: of stills and clips, or of clips only.
-        clips_only = len(self._pools) > 1 and config.data.clip_share == 1
+        clips_only = len(self._pools) > 1 and config.data.clip_fraction == 1
         self._drawn = self._pools[1:] if clips_only else self._pools
         still, clip = self._match_pools
         drawn_matches = (clip,) if clip and clips_only else (still, clip)
         self._drawn_matches = [pool for pool in drawn_matches if pool]
         self._text_length = self._caption_length()
-        self._align_share = self._share_of_align_steps()
+        self._align_fraction = self._fraction_of_align_steps()
         self._align = StepSchedule(self._align_kinds)
         self._match = StepSchedule(self._match_kinds)
 
@@ -202,7 +202,7 @@ class Loader(BatchSource):
         data = self.config.data
         return prefetch_batches(self._plan, range(start, stop), data.threads, data.prefetch)
 
-    def _share_of_align_steps(self) -> float:
+    def _fraction_of_align_steps(self) -> float:
         """Return the fraction of steps that align; 1 if each step does.
 
         In separate steps (release) it is that of an epoch, so that rows and anchors come equally
@@ -216,15 +216,15 @@ class Loader(BatchSource):
 
     def _kinds(self, steps: np.ndarray) -> np.ndarray:
         """Return whether each of the steps i64 (n,) is of stills (0) or clips (1)."""
-        share = self.config.data.clip_share if len(self._pools) > 1 else 0.0
+        fraction = self.config.data.clip_fraction if len(self._pools) > 1 else 0.0
         if self.config.data.order == "alternate":
             # a clip wherever the number of clips due so far has grown
-            return (np.floor((steps + 1) * share) > np.floor(steps * share)).astype(np.int8)
-        return (uniform_per_step(self.config.run.seed, _KIND, steps) < share).astype(np.int8)
+            return (np.floor((steps + 1) * fraction) > np.floor(steps * fraction)).astype(np.int8)
+        return (uniform_per_step(self.config.run.seed, _KIND, steps) < fraction).astype(np.int8)
 
     def _align_kinds(self, steps: np.ndarray) -> np.ndarray:
         """Return the kind of the alignment in each of the steps i64 (n,), _NONE without one."""
-        aligns = uniform_per_step(self.config.run.seed, _PART, steps) < self._align_share
+        aligns = uniform_per_step(self.config.run.seed, _PART, steps) < self._align_fraction
         return np.where(aligns, self._kinds(steps), _NONE)
 
     def _match_kinds(self, steps: np.ndarray) -> np.ndarray:
@@ -390,7 +390,7 @@ class Loader(BatchSource):
     def _empty(self, rows: int, frames: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the empty clips and sensors of this shard, of a batch of so many rows."""
         size = self.config.model.image_size
-        rows = self._shard.share(rows)
+        rows = self._shard.fraction(rows)
         return np.zeros((rows, frames, size, size, 3), np.uint8), np.zeros(rows, np.int32)
 
     def _empty_slots(self, image_row: np.ndarray, text_row: np.ndarray) -> tuple[np.ndarray, ...]:

@@ -18,7 +18,7 @@ import pyarrow.compute as pc
 
 from anytouch_jax.config import RELEASE_WEIGHTS, Config
 from anytouch_jax.data.background.contact import known_contact
-from anytouch_jax.data.background.rule import ADVICE, UnitGels
+from anytouch_jax.data.background.rule import ADVICE, Backgrounds
 from anytouch_jax.data.loading.sampling import (
     EpochSampler,
     Matches,
@@ -128,7 +128,7 @@ def find_pools(
     config: Config,
     tokenizer: Tokenizer | None,
     devices: int,
-    gels: UnitGels | None = None,
+    backgrounds: Backgrounds | None = None,
 ) -> Pools:
     """Return the pools of the split `config.data.split`.
 
@@ -137,14 +137,14 @@ def find_pools(
         config: Of the run.
         tokenizer: Of the captions; without it one is read or trained if it is needed.
         devices: The image and text slots of a batch are a multiple of it.
-        gels: The backgrounds that are subtracted, if any are. Rows without one are left out if the
-            model needs one.
+        backgrounds: The backgrounds that are subtracted, if any are. Rows without one are left out
+            if the model needs one.
 
     Raises:
         UserError: For an empty split, an unknown sensor, an unfit tokenizer, and data without a
             training signal.
     """
-    usable, notes = _usable_rows(manifest, config, gels)
+    usable, notes = _usable_rows(manifest, config, backgrounds)
     tokenizer, note = _tokenizer_of(manifest, config, usable, tokenizer)
     notes += note
     if config.stage == 2 and config.model.text:
@@ -160,7 +160,7 @@ def find_pools(
         for kind, windows in ((STILL, stills), (CLIP, clips))
         if len(windows)
     )
-    if len(touch) == 1 and data.clip_share:
+    if len(touch) == 1 and data.clip_fraction:
         notes.append(
             f"split {data.split!r} has no clip of {length} frames, so all batches are stills"
         )
@@ -207,7 +207,7 @@ def _check_signal(
     has_modality = any(len(ids) for pool in touch for ids in pool.members[:_NEITHER])
     if config.stage == 2 and not (has_modality or any(match) or config.reconstructs):
         raise UserError(
-            f"stage 2 has nothing to learn from split {config.data.split!r}. It needs photographs "
+            f"stage 2 has nothing to learn from split {config.data.split!r}. It needs RGB images "
             "(image_path), captions (text), or places touched by two sensors (touch). Add one with "
             "its tower or head, or train stage 1."
         )
@@ -215,7 +215,7 @@ def _check_signal(
 
 def _clips(manifest: Manifest, config: Config, usable: _Usable, length: int) -> np.ndarray:
     """Return the clips of usable rows, i64 (clips, length); none for a run of stills."""
-    if not config.data.clip_share:
+    if not config.data.clip_fraction:
         return np.empty((0, length), np.int64)
     clips = manifest.clips(length, config.data.split)
     good = usable.ends[clips[:, -1]]
@@ -308,7 +308,7 @@ def _match_pools(
         return MatchPool(windows, matches, anchors)
 
     still = pool(STILL, stills)
-    clip = pool(CLIP, clips) if config.data.clip_share else None
+    clip = pool(CLIP, clips) if config.data.clip_fraction else None
     notes = []
     if still is None:
         reason = "no place (column 'touch') was touched by two sensors or units"
@@ -324,7 +324,7 @@ def _match_pools(
 
 
 def _usable_rows(
-    manifest: Manifest, config: Config, gels: UnitGels | None
+    manifest: Manifest, config: Config, backgrounds: Backgrounds | None
 ) -> tuple[_Usable, list[str]]:
     """Return the rows of the split that may be drawn, and notes.
 
@@ -341,9 +341,9 @@ def _usable_rows(
             f"{files}: split {split!r} has no row of a known sensor with images; "
             "add some, or the sensor by --model.sensors"
         )
-    if gels is not None:
-        notes.append(gels.report(rows))
-        missing, note = _without_background(manifest, config, rows, gels)
+    if backgrounds is not None:
+        notes.append(backgrounds.report(rows))
+        missing, note = _without_background(manifest, config, rows, backgrounds)
         notes += note
         if len(missing):
             sensor = sensor.copy()
@@ -372,7 +372,7 @@ def _usable_rows(
 
 
 def _without_background(
-    manifest: Manifest, config: Config, rows: np.ndarray, gels: UnitGels
+    manifest: Manifest, config: Config, rows: np.ndarray, backgrounds: Backgrounds
 ) -> tuple[np.ndarray, list[str]]:
     """Return the rows that are left out for want of a background, and notes.
 
@@ -380,16 +380,16 @@ def _without_background(
     """
     if config.data.background != "subtract":
         return rows[:0], []
-    missing = rows[~gels.has(rows)]
+    missing = rows[~backgrounds.has(rows)]
     if len(missing) == len(rows):
         raise ManifestError(
-            f"{manifest.where(int(rows[0]))} and {len(rows) - 1} other rows have no picture of "
+            f"{manifest.where(int(rows[0]))} and {len(rows) - 1} other rows have no image of "
             f"the untouched gel, which --data.background subtract requires. {ADVICE}"
         )
     if not len(missing):
         return missing, []
     return missing, [
-        f"{len(missing)} of {len(rows)} rows have no picture of the untouched gel, and are left out"
+        f"{len(missing)} of {len(rows)} rows have no image of the untouched gel, and are left out"
     ]
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from anytouch_jax.batch import TouchBatch
 from anytouch_jax.config import Config
 from anytouch_jax.data import transforms
-from anytouch_jax.data.background.rule import ADVICE, UnitGels
+from anytouch_jax.data.background.rule import ADVICE, Backgrounds
 from anytouch_jax.data.images import decode
 from anytouch_jax.data.loading.threads import BatchJobs, prefetch_batches
 from anytouch_jax.data.manifest.manifest import Manifest, sensor_rows
@@ -58,17 +58,17 @@ class SampleReader:
     Attributes:
         manifest: The frames.
         config: Of the run.
-        gels: The backgrounds, by default those of the rule if they are subtracted.
+        backgrounds: The backgrounds, by default those of the rule if they are subtracted.
     """
 
     manifest: Manifest
     config: Config
-    gels: UnitGels | None = None
+    backgrounds: Backgrounds | None = None
     _cache: dict[Path, _Loaded] = field(default_factory=dict, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        if self.gels is None and self.config.data.background != "keep":
-            object.__setattr__(self, "gels", UnitGels(self.manifest))
+        if self.backgrounds is None and self.config.data.background != "keep":
+            object.__setattr__(self, "backgrounds", Backgrounds(self.manifest))
 
     def touch(
         self,
@@ -93,8 +93,8 @@ class SampleReader:
         data = self.config.data
         augments = epoch is not None and bool(data.flip or any(data.affine) or any(data.jitter))
         gel = None
-        if data.background != "keep" and self.gels is not None:
-            gel = self.gels(row)
+        if data.background != "keep" and self.backgrounds is not None:
+            gel = self.backgrounds(row)
         subtracts = self._subtracts(row, epoch, gel)
         # In training, frames are resized once and kept. But a background is subtracted at the
         # original size, as in evaluation, unless both are augmented first.
@@ -138,12 +138,12 @@ class SampleReader:
     def _background(
         self, row: int, gel: np.ndarray | None, load: Callable[[Path], _Loaded]
     ) -> _Loaded:
-        """Return the background of a row: that of its sensor instance, else its stored picture."""
+        """Return the background of a row: that of its sensor instance, else its stored image."""
         if gel is not None:
             return _Loaded(gel, gel.shape)
         if self.manifest.value(row, "background_path") is None:
             raise SampleError(
-                f"{self.manifest.where(row)} has no picture of the untouched gel. {ADVICE}"
+                f"{self.manifest.where(row)} has no image of the untouched gel. {ADVICE}"
             )
         return self._load(row, "background_path", load)
 
@@ -276,7 +276,7 @@ def evaluation(  # noqa: PLR0913, for callers that name them
     prepare: Prepare | None = None,
     like: np.ndarray | None = None,
     skipped: list[str] | None = None,
-    gels: UnitGels | None = None,
+    backgrounds: Backgrounds | None = None,
 ) -> Iterator[tuple[np.ndarray, TouchBatch[np.ndarray]]]:
     """Yield (row ids i64 (n,), TouchBatch of B rows) over rows in order, the same bytes every time.
 
@@ -293,7 +293,7 @@ def evaluation(  # noqa: PLR0913, for callers that name them
         prepare: Makes an array of a frame u8 (h, w, 3) and of its background or None.
         like: An array of the shape and type that `prepare` returns.
         skipped: Gets a sentence for each of the first NAMED rows that are left out.
-        gels: The backgrounds, by default those of the rule if they are subtracted.
+        backgrounds: The backgrounds, by default those of the rule if they are subtracted.
 
     Raises:
         ManifestError: For an unknown sensor.
@@ -315,7 +315,7 @@ def evaluation(  # noqa: PLR0913, for callers that name them
         )
     side = config.model.image_size
     data = config.data
-    reader = SampleReader(manifest, config, gels)
+    reader = SampleReader(manifest, config, backgrounds)
     blank = np.zeros((side, side, 3), np.uint8) if like is None else like
     named: list[str] = [] if skipped is None else skipped
 

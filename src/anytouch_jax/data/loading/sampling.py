@@ -377,13 +377,13 @@ class Shard:
                 "them"
             )
 
-    def share(self, slots: int) -> int:
+    def fraction(self, slots: int) -> int:
         """Return the number of slots of this part."""
         return slots // self.count
 
     def cut(self, array: np.ndarray) -> np.ndarray:
         """Return a view of this part of an array."""
-        size = self.share(len(array))
+        size = self.fraction(len(array))
         return array[self.index * size : (self.index + 1) * size]
 
     def place(self, slot: int | None, slots: int) -> int | None:
@@ -393,7 +393,7 @@ class Shard:
         """
         if slot is None:
             return None
-        position = slot - self.index * self.share(slots)
-        if 0 <= position < self.share(slots):
+        position = slot - self.index * self.fraction(slots)
+        if 0 <= position < self.fraction(slots):
             return position
         return None

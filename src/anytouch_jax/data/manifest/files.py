@@ -3,7 +3,7 @@
 * `touch/00000.zip/17` is file 17 of a shard of `pack`: a ZIP file without compression, so a random
   file costs one read.
 * `data-000000.tar/17` is regular file 17 of a tar without compression, as WebDataset writes it.
-* `train-00000.parquet/image/17` is the cell of row 17 in a column of bytes, or of pictures of
+* `train-00000.parquet/image/17` is the cell of row 17 in a column of bytes, or of images of
   Hugging Face.
 * `touch/00000.parquet/17` is a shard of version 1 with its index next to it.
 * `s3://bucket/train-00000.parquet/image/17` is in an object store. A shard is copied whole on its
@@ -261,7 +261,7 @@ class _Column:
                 self._hold(group)
             cells = self._held[group]
         value = cells[row - int(self._starts[group])].as_py()
-        if isinstance(value, dict):  # Hugging Face's pictures are pairs of bytes and path
+        if isinstance(value, dict):  # Hugging Face's images are pairs of bytes and path
             value = value.get("bytes")
         if not isinstance(value, bytes):
             raise ShardError(f"row {row} of the shard has no bytes in column {self._name!r}")

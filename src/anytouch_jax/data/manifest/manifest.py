@@ -278,7 +278,7 @@ def _real_file(path: Path) -> Path:
     file = path.resolve()
     if path.is_symlink() and path.suffix and not file.suffix:
         raise ManifestError(
-            f"{path} is a link into a cache, as its pictures may be; download the data into a "
+            f"{path} is a link into a cache, as its images may be; download the data into a "
             "separate folder (hf download --local-dir)"
         )
     return file

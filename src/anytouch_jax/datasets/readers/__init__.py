@@ -58,7 +58,7 @@ class IndexReport:
     skipped: dict[str, tuple[int, str]]
     notes: list[str]
     left_out: int = 0  # frames without a row
-    written: int = 0  # pictures that were written into ROOT
+    written: int = 0  # images that were written into ROOT
 
     @property
     def splits(self) -> dict[str, int]:
@@ -90,8 +90,10 @@ class IndexReport:
         found = ", ".join(
             f"{name.removeprefix('label.')} {manifest.present(name).sum():,}" for name in labels
         )
-        share = f" ({reader.paper_note})" if reader.paper_note else ""
-        paper = f"{reader.paper:,} in the paper{share}" if reader.paper else "no count in the paper"
+        fraction = f" ({reader.paper_note})" if reader.paper_note else ""
+        paper = (
+            f"{reader.paper:,} in the paper{fraction}" if reader.paper else "no count in the paper"
+        )
         use = (
             "commercial use allowed"
             if reader.commercial
@@ -104,7 +106,7 @@ class IndexReport:
             f"frames read {len(manifest) + self.left_out:,}, rows {len(manifest):,}, without a row "
             f"{self.left_out:,}",
             f"touch frames {self.frames:,}; {paper}",
-            f"with photograph {image:,}, with text {text:,}, in a touch pair {touch:,}",
+            f"with RGB image {image:,}, with text {text:,}, in a touch pair {touch:,}",
             *([f"labels found: {found}"] if found else []),
             f"licence: {reader.license}; {use}" + (f" ({reader.url})" if reader.url else ""),
             f"to be cited: {reader.citation}",

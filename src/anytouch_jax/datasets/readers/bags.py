@@ -77,7 +77,7 @@ def _bags(index: DatasetIndex) -> None:
 
     The time of a frame is that of its header, else that of the log, in nanoseconds (column `time`).
     Labels are the values of other topics that are nearest in time, at most a tenth of a second
-    away. Their `values` read NAME=TOPIC:FIELD. What is no picture that can be read is left out, and
+    away. Their `values` read NAME=TOPIC:FIELD. What is no image that can be read is left out, and
     counted by topic.
     """
     index.need_sensor()
@@ -94,7 +94,7 @@ def _bags(index: DatasetIndex) -> None:
 class _Streams(NamedTuple):
     """What was read of a recording.
 
-    `times` are those of the pictures of each topic, in nanoseconds, and `exports` where they were
+    `times` are those of the images of each topic, in nanoseconds, and `exports` where they were
     written. `series` are the values (time, value) of each label. `topics` are all topics that were
     seen.
     """
@@ -106,11 +106,11 @@ class _Streams(NamedTuple):
 
 
 def _add_recording(index: DatasetIndex, path: str, places: dict[str, tuple[str, str]]) -> None:
-    """Write the pictures of a recording, all or none, and add its rows.
+    """Write the images of a recording, all or none, and add its rows.
 
     `places` are the topic and the field of each label by its name.
     """
-    # The exports are complete when the stack closes: an error before that leaves no picture.
+    # The exports are complete when the stack closes: an error before that leaves no image.
     with ExitStack() as stack:
         streams = _read_streams(index, path, places, stack)
     if not streams.times:
@@ -149,12 +149,12 @@ def _add_recording(index: DatasetIndex, path: str, places: dict[str, tuple[str, 
 def _read_streams(
     index: DatasetIndex, path: str, places: dict[str, tuple[str, str]], stack: ExitStack
 ) -> _Streams:
-    """Read a recording once: write the pictures of each topic, and keep the values of labels."""
+    """Read a recording once: write the images of each topic, and keep the values of labels."""
     file = index.root / path
     keys = index.options.keys
     sources = sorted(one for one in file.iterdir() if one.is_file()) if file.is_dir() else [file]
     wanted = {*keys, *(topic for topic, _ in places.values())} if keys else None
-    counts: Counter[str] = Counter()  # of all pictures of a topic, also of those left out
+    counts: Counter[str] = Counter()  # of all images of a topic, also of those left out
     streams = _Streams({}, {}, {name: [] for name in places}, set())
     for message in read_messages(file, wanted):
         streams.topics.add(message.topic)
@@ -166,12 +166,12 @@ def _read_streams(
             continue
         where = f"{path}, topic {message.topic}, frame {counts[message.topic]}"
         try:
-            picture = picture_of(message)
+            image = image_of(message)
         except UserError as error:
             index.leave_out(str(error), where)
             counts[message.topic] += 1
             continue
-        if picture is None:  # a message of another kind
+        if image is None:  # a message of another kind
             continue
         counts[message.topic] += 1
         if message.topic not in streams.exports:
@@ -180,7 +180,7 @@ def _read_streams(
             export = exported(index, folder, f"{file.name}{message.topic}", sources)
             streams.exports[message.topic] = stack.enter_context(export)
         own = streams.times.setdefault(message.topic, [])
-        streams.exports[message.topic].save(f"{len(own):06d}.png", picture)
+        streams.exports[message.topic].save(f"{len(own):06d}.png", image)
         own.append(_time(message))
     return streams
 
@@ -333,8 +333,8 @@ def _mcap_messages(path: Path, topics: set[str] | None) -> Iterator[Message]:
             yield Message(channel.topic, message.log_time, kind, content)
 
 
-def picture_of(message: Message) -> np.ndarray | None:
-    """Return the picture RGB u8 of a message of sensor_msgs or foxglove, None for another.
+def image_of(message: Message) -> np.ndarray | None:
+    """Return the image RGB u8 of a message of sensor_msgs or foxglove, None for another.
 
     Raises UserError.
     """
@@ -347,32 +347,32 @@ def picture_of(message: Message) -> np.ndarray | None:
     data = base64.b64decode(content.data) if isinstance(content.data, str) else bytes(content.data)
     if kind == "CompressedImage":
         if "compressedDepth" in str(content.format):
-            raise DatasetError("picture of depth")
-        return decode_bytes(data, "picture")
+            raise DatasetError("image of depth")
+        return decode_bytes(data, "image")
     if content.encoding not in _ENCODINGS:
-        raise DatasetError(f"picture of encoding {content.encoding}, which is not read")
+        raise DatasetError(f"image of encoding {content.encoding}, which is not read")
     (channels, size, change) = _ENCODINGS[content.encoding]
     width = int(content.width)
     height = int(content.height)
     step = int(content.step)
     row = width * channels * size
     if step < row or not width or not height:
-        raise DatasetError(f"picture of {width} x {height} pixels and {step} bytes a row")
+        raise DatasetError(f"image of {width} x {height} pixels and {step} bytes a row")
     if height * step > len(data):
-        raise DatasetError("picture that is cut short")
+        raise DatasetError("image that is cut short")
     flat = np.frombuffer(data, np.uint8, height * step).reshape(height, step)[:, :row]
-    picture = np.ascontiguousarray(flat)
+    image = np.ascontiguousarray(flat)
     if size == 2:
-        wide = picture.view(">u2" if getattr(content, "is_bigendian", False) else "<u2")
-        picture = ((wide.astype(np.uint32) + 128) // 257).astype(np.uint8)
-    picture = picture.reshape(height, width, channels)
+        wide = image.view(">u2" if getattr(content, "is_bigendian", False) else "<u2")
+        image = ((wide.astype(np.uint32) + 128) // 257).astype(np.uint8)
+    image = image.reshape(height, width, channels)
     try:
         if change is None:
-            return picture
-        return cv2.cvtColor(picture, change)
+            return image
+        return cv2.cvtColor(image, change)
     except cv2.error as error:  # of an odd width or height
         raise DatasetError(
-            f"picture of {width} x {height} pixels in {content.encoding}: {error.err}"
+            f"image of {width} x {height} pixels in {content.encoding}: {error.err}"
         ) from None
 
 

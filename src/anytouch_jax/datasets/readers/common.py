@@ -57,7 +57,7 @@ MOST_LABELS = 1000  # of one value
 TACTILE = re.compile(r"tactile|gelsight|digit|touch|gel(?![a-z])", re.IGNORECASE)
 PARTS = ("train", "val", "test")  # published splits
 NUMBERED = r"(\d+)\.(?:png|jpe?g)"
-EXPORT_RECORD = ".anytouch.json"  # in a folder of pictures that a reader has written
+EXPORT_RECORD = ".anytouch.json"  # in a folder of images that a reader has written
 SYSTEM_FILES = ("Thumbs.db", "desktop.ini", "__MACOSX")
 _ALLOWED = {  # names in a pickle
     ("numpy", "ndarray"),
@@ -95,7 +95,7 @@ class IndexOptions:
     sensor: str | None = None
     split_by: str | None = None
     singles: bool = False
-    films: bool = False
+    videos: bool = False
     order: Literal["names", "times"] = "names"
     labels: Path | None = None
     url: str | None = None
@@ -151,7 +151,7 @@ class DatasetIndex:
         self._contact_rows = 0
         self.wanted: list[str] = []  # columns that the user asked for
         self.left_out = 0  # frames without a row
-        self.written = 0  # pictures that were written into ROOT
+        self.written = 0  # images that were written into ROOT
         self.table: Columns = {name: [] for name in REQUIRED}
 
     @staticmethod
@@ -265,19 +265,18 @@ class DatasetIndex:
         known = [name for name in SENSORS if name not in (*FIELD_SENSORS, UNIVERSAL)]
         if self.options.sensor is None or self.options.sensor in (*FIELD_SENSORS, UNIVERSAL):
             raise UserError(
-                f"name the sensor of these pictures with --sensor: {', '.join(known)}, or a new "
-                "name"
+                f"name the sensor of these images with --sensor: {', '.join(known)}, or a new name"
             )
         check_spelling(self.options.sensor)
         return self.options.sensor
 
     def need_export(self, what: str) -> None:
-        """Raise DatasetError without the option `export`: the pictures of `what` must be written as
+        """Raise DatasetError without the option `export`: the images of `what` must be written as
         files.
         """
         if not self.options.export:
             raise DatasetError(
-                f"{self.root} has {what}; add --export to write their pictures next to them"
+                f"{self.root} has {what}; add --export to write their images next to them"
             )
 
     def frames(
@@ -305,14 +304,14 @@ class DatasetIndex:
                 frames[int(parts[1])] = name
         return dict(sorted(frames.items()))
 
-    def photographs(
+    def rgb_images(
         self, folder: str, names: Iterable[str], on_disk: Collection[str]
     ) -> list[str | None]:
         """Return the path of each of `names` in `folder`, None for those that are not `on_disk`,
         which are counted.
         """
         paths = [f"{folder}/{name}" if name in on_disk else None for name in names]
-        self.skip("photograph missing (kept without)", folder, paths.count(None))
+        self.skip("RGB image missing (kept without)", folder, paths.count(None))
         return paths
 
     def split_of(self, group: str) -> str:
@@ -440,15 +439,15 @@ def _flat(value: Any, place: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, 
 
 
 def hash_split(dataset: str, group: str, options: IndexOptions) -> str:
-    """Return val, test or train by the share of SHA-256(dataset/group) in its range.
+    """Return val, test or train by the fraction of SHA-256(dataset/group) in its range.
 
     Other groups move none.
     """
     digest = hashlib.sha256(f"{dataset}/{group}".encode()).digest()
-    share = int.from_bytes(digest[:8], "big") / 2**64
-    if share < options.val:
+    fraction = int.from_bytes(digest[:8], "big") / 2**64
+    if fraction < options.val:
         return "val"
-    if share < options.val + options.test:
+    if fraction < options.val + options.test:
         return "test"
     return "train"
 

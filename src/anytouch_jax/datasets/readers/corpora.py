@@ -64,7 +64,7 @@ _LABELS = {
     "f_z": "force_z",
     **{name: name for name in ("x_mm", "y_mm", "z_mm", "quat_x", "quat_y", "quat_z", "quat_w")},
 }
-_PICTURES = (".jpg", ".jpeg", ".png", ".webp", ".bmp")
+_IMAGES = (".jpg", ".jpeg", ".png", ".webp", ".bmp")
 _TEXTS = ("txt", "text", "cls")
 _CAPTION = re.compile(r"caption|text|prompt|sentence|instruction|description", re.IGNORECASE)
 _BACKGROUND = re.compile(
@@ -96,7 +96,7 @@ def _gelsight_mini(index: DatasetIndex) -> None:
     """GelSight Mini touches of 13 public sources, one schema of 30 columns:
     <source>/<split>-<n>.parquet.
 
-    The licence is that of the source. A frame of a film (`frame_idx`) belongs to its capture, any
+    The licence is that of the source. A frame of a video (`frame_idx`) belongs to its capture, any
     other is a sequence. Splits called test* are test, and those of no usual name are by hash of the
     capture.
     """
@@ -126,14 +126,14 @@ def _gelsight_mini(index: DatasetIndex) -> None:
             capture = "/".join(
                 str(part) for part in (source, row["capture"], side) if part is not None
             )
-            is_film = frame is not None and counts[row["capture"], side, frame] == 1
+            is_video = frame is not None and counts[row["capture"], side, frame] == 1
             split = str(row.get("split") or Path(path).name.split("-")[0])
             index.add(
                 [f"{path}/image/{number}"],
                 sensor="gelsight_mini",
                 dataset=f"gelsight_mini_pretrain/{source}",
-                sequence=capture if is_film else f"{capture}/{Path(path).stem}/{number}",
-                frame_index=frame if is_film else 0,
+                sequence=capture if is_video else f"{capture}/{Path(path).stem}/{number}",
+                frame_index=frame if is_video else 0,
                 object=row.get("obj_name"),
                 unit=side,
                 split=split
@@ -156,7 +156,7 @@ def _webdataset(index: DatasetIndex) -> None:
     """Tars of WebDataset: a sample is the files of one key, which ends at the first point of their
     names.
 
-    Pictures are touches, photographs or backgrounds by their field. Values of .json and .cls become
+    Images are touches, RGB images or backgrounds by their field. Values of .json and .cls become
     labels, `object` the object, .txt the caption. Every touch is a sequence. The split is that of a
     folder or shard called train or val, or `split` of the JSON, or the hash of object or key.
     """
@@ -237,25 +237,25 @@ def _add_sample(
     key: str,
     **cells: Any,
 ) -> None:
-    """Add a row for each tactile picture of a sample.
+    """Add a row for each tactile image of a sample.
 
     Its other files are RGB images, captions and labels. `fields` are the files by the end of their
     name, with their place in the tar at `path`; `texts` those that were read as text or JSON.
     `place` is the sequence of the sample, `key` its name, and `split` that of its tar, if stated.
     """
-    pictures = {
+    images = {
         field: kind_of_picture(field, index.options.keys)
         for field in fields
-        if f".{field.rpartition('.')[2]}" in _PICTURES
+        if f".{field.rpartition('.')[2]}" in _IMAGES
     }
-    touches = _touches_of(pictures, index.options.keys)
+    touches = _touches_of(images, index.options.keys)
     for field in fields:
-        kind = pictures.get(field)
+        kind = images.get(field)
         where = f"{path}/{key}.{field}"
         if kind == "other" or (kind == "touch" and field not in touches):
-            index.leave_out("picture that no word calls tactile (--keys names its field)", where)
+            index.leave_out("image that no word calls tactile (--keys names its field)", where)
         elif kind is None and field not in texts:
-            index.skip("file of a sample that is no picture, label or text", where)
+            index.skip("file of a sample that is no image, label or text", where)
     values, captions = _values_and_captions(texts)
     stated = split_word(str(values.get("split"))) if split is None else None
     if stated is not None:
@@ -265,10 +265,10 @@ def _add_sample(
     for name, value in values.items():
         for label, (cell,) in label_cells(name, [value]).items():
             labels[f"label.{label.removeprefix('has_')}"] = cell
-    # Reversed, so that the first picture of a kind stays.
-    others = {kind: f"{path}/{fields[field]}" for field, kind in reversed(pictures.items())}
+    # Reversed, so that the first image of a kind stays.
+    others = {kind: f"{path}/{fields[field]}" for field, kind in reversed(images.items())}
     if not touches:
-        index.skip("sample without a tactile picture", f"{path}/{key}")
+        index.skip("sample without a tactile image", f"{path}/{key}")
     has_several = len(touches) > 1
     for field in touches:
         unit = field.rpartition(".")[0] or None
@@ -287,15 +287,15 @@ def _add_sample(
         )
 
 
-def _touches_of(pictures: Mapping[str, str], keys: Sequence[str]) -> list[str]:
-    """Return the fields of a sample that are tactile pictures.
+def _touches_of(images: Mapping[str, str], keys: Sequence[str]) -> list[str]:
+    """Return the fields of a sample that are tactile images.
 
-    A bare `jpg` is one where no picture with a name is: beside `gel.jpg` it is something else,
+    A bare `jpg` is one where no image with a name is: beside `gel.jpg` it is something else,
     unless --keys names it.
     """
-    is_named = any(kind == "touch" and "." in field for field, kind in pictures.items())
+    is_named = any(kind == "touch" and "." in field for field, kind in images.items())
     touches = []
-    for field, kind in pictures.items():
+    for field, kind in images.items():
         counts = "." in field or not is_named or field in keys
         if kind == "touch" and counts:
             touches.append(field)
@@ -420,7 +420,7 @@ def _taxim_presses(index: DatasetIndex) -> None:
     which is not imported.
 
     `calib/<sensor>/dataPack.npz` has `f0`, the untouched gel, `imgs`, BGR u8 480 x 640,
-    `touch_center` and `touch_radius` in pixels. Pictures are written into ROOT/taxim_presses.
+    `touch_center` and `touch_radius` in pixels. Images are written into ROOT/taxim_presses.
     `lists` may name another `calib` folder. Every press is a sequence, split by hash. Raises
     DatasetError without the package.
     """
@@ -440,16 +440,16 @@ def _taxim_presses(index: DatasetIndex) -> None:
             continue
         try:
             with np.load(path, allow_pickle=False) as pack:
-                gel, images, centres, radii = (
+                gel, presses, centres, radii = (
                     pack[key] for key in ("f0", "imgs", "touch_center", "touch_radius")
                 )
         except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
             raise DatasetError(f"{path} is not a calibration pack of taxim: {error}") from None
-        names = [f"press_{i:02d}" for i in range(len(images))]
-        with exported(index, place, sensor, [path]) as pictures:
-            for name, image in zip(("background", *names), (gel, *images), strict=True):
-                pictures.save(f"{name}.png", image[..., ::-1])
-        place = pictures.folder
+        names = [f"press_{i:02d}" for i in range(len(presses))]
+        with exported(index, place, sensor, [path]) as images:
+            for name, image in zip(("background", *names), (gel, *presses), strict=True):
+                images.save(f"{name}.png", image[..., ::-1])
+        place = images.folder
         cells = {"sensor": sensor, "unit": f"taxim/{sensor}", "frame_index": 0}
         index.add(
             [f"{place}/{name}.png" for name in names],

@@ -1,8 +1,8 @@
-"""Pictures that readers write: each folder of them belongs to one stream of one source, by a record
+"""Images that readers write: each folder of them belongs to one stream of one source, by a record
 in it.
 
-The record names the stream, the files of its source with size, time and SHA-256, and the pictures.
-A changed source replaces its old pictures. Folders without a record, or with one of another stream,
+The record names the stream, the files of its source with size, time and SHA-256, and the images.
+A changed source replaces its old images. Folders without a record, or with one of another stream,
 are never changed.
 """
 
@@ -30,7 +30,7 @@ _TRIES = 1000  # folders of one name
 
 
 class Export:
-    """The pictures of a stream in `folder`, which is final when `exported` ends; `is_new` if they
+    """The images of a stream in `folder`, which is final when `exported` ends; `is_new` if they
     must be written.
     """
 
@@ -40,15 +40,15 @@ class Export:
         self.names = list[str]()
         self._place = place
 
-    def save(self, name: str, picture: np.ndarray | bytes) -> None:
-        """Write a picture RGB u8 (h, w, 3), or the bytes of its file.
+    def save(self, name: str, image: np.ndarray | bytes) -> None:
+        """Write an image RGB u8 (h, w, 3), or the bytes of its file.
 
         One that is there already is kept.
         """
         self.names.append(name)
         file = self._place / name
         if self.is_new or not file.is_file():
-            data = picture if isinstance(picture, bytes) else encode(np.ascontiguousarray(picture))
+            data = image if isinstance(image, bytes) else encode(np.ascontiguousarray(image))
             atomic_write(file, data, sync=False)
 
 
@@ -56,10 +56,10 @@ class Export:
 def exported(
     index: DatasetIndex, folder: str, stream: str, sources: Sequence[Path], which: object = None
 ) -> Iterator[Export]:
-    """Give the pictures of `stream` in `folder`, or in a folder of a name like it if that holds
+    """Give the images of `stream` in `folder`, or in a folder of a name like it if that holds
     something else.
 
-    `sources` and `which` decide the pictures, which come to be as a whole when the block ends.
+    `sources` and `which` decide the images, which come to be as a whole when the block ends.
     Raises DatasetError if nothing can be written.
     """
     place, record = find_export(index.root, folder, stream)
@@ -81,7 +81,7 @@ def exported(
             index.written += len(export.names)
     except OSError as error:
         raise UserError(
-            f"the pictures of {sources[0]} cannot be written to {index.root / folder}: "
+            f"the images of {sources[0]} cannot be written to {index.root / folder}: "
             f"{error.strerror or error}; make its folder writable"
         ) from None
     finally:
@@ -89,7 +89,7 @@ def exported(
 
 
 def find_export(root: Path, folder: str, stream: str) -> tuple[str | None, dict[str, Any] | None]:
-    """Return the folder that holds the pictures of a stream, and its record; (None, None) if there
+    """Return the folder that holds the images of a stream, and its record; (None, None) if there
     is none.
     """
     for name in _names(folder):
@@ -147,7 +147,7 @@ def _move(
     record: dict[str, Any] | None,
     names: list[str],
 ) -> str:
-    """Move new pictures to their folder, and return it.
+    """Move new images to their folder, and return it.
 
     Files of the user in a replaced folder stay in it.
     """
@@ -157,7 +157,7 @@ def _move(
         own = [entry.name for entry in os.scandir(old) if entry.name not in ours]
         if both := sorted({*own} & {*names}):
             raise DatasetError(
-                f"{old / both[0]} is a file of yours where a picture has to go; move it elsewhere"
+                f"{old / both[0]} is a file of yours where an image has to go; move it elsewhere"
             )
         aside = part_path(old.with_name(f"{old.name}.old"))
         os.replace(old, aside)
@@ -179,7 +179,7 @@ def _move(
             os.replace(part / EXPORT_RECORD, target / EXPORT_RECORD)
             break
     if name != folder:
-        index.notes.append(f"{folder} holds something else: the pictures of its name are in {name}")
+        index.notes.append(f"{folder} holds something else: the images of its name are in {name}")
     return name
 
 
@@ -194,17 +194,17 @@ def export_video(index: DatasetIndex, video: str) -> str:
     Raises ImageError or DatasetError.
     """
     file = index.root / video
-    with exported(index, video.removesuffix(file.suffix), file.name, [file]) as pictures:
-        if pictures.is_new:
+    with exported(index, video.removesuffix(file.suffix), file.name, [file]) as images:
+        if images.is_new:
             declared = count_frames(file)
             for count, frame in enumerate(
                 tracked(frames_from_video(file), "frames written", declared or None)
             ):
-                pictures.save(f"{count:06d}.png", frame)
+                images.save(f"{count:06d}.png", frame)
             if (
-                0.98 * declared > (count := len(pictures.names)) + 2
+                0.98 * declared > (count := len(images.names)) + 2
             ):  # some containers only estimate it
                 index.notes.append(
                     f"{video} declares {declared} frames and {count} could be read; is it whole?"
                 )
-    return pictures.folder
+    return images.folder

@@ -57,10 +57,10 @@ def _force(index: DatasetIndex) -> None:
                 f"{index.root / folder} has no slides or no frames; download it again"
             )
         sources = [index.root / folder / name for name in files]
-        with exported(index, f"{folder}/frames", "frames", sources) as pictures:
+        with exported(index, f"{folder}/frames", "frames", sources) as images:
             written = enumerate(index.tracked(frames, "frames written"))
-            names = [_picture(pictures, frame, f"{i:06d}", sources[0]) for i, frame in written]
-        names = [f"{pictures.folder}/{name}" for name in names]
+            names = [_image(images, frame, f"{i:06d}", sources[0]) for i, frame in written]
+        names = [f"{images.folder}/{name}" for name in names]
         contact = np.ravel(content.get("in_contact", np.ones(len(names))))
         free = np.flatnonzero(contact == 0)
         gel = names[int(free[0])] if len(free) and free[0] < len(names) else None
@@ -144,10 +144,10 @@ def _add_bag(index: DatasetIndex, part: str, folder: str, bag: str) -> None:
             "frame or pose without the other", f"{path}, {finger}", abs(len(frames) - len(poses))
         )
         name = f"{part}/{folder}/{bag.removesuffix('.pkl')}/{finger}"
-        with exported(index, name, finger, [path]) as pictures:
+        with exported(index, name, finger, [path]) as images:
             written = index.tracked(range(count), "frames written")
-            names = [_picture(pictures, frames[i], f"{i:06d}", path) for i in written]
-        names = [f"{pictures.folder}/{one}" for one in names]
+            names = [_image(images, frames[i], f"{i:06d}", path) for i in written]
+        names = [f"{images.folder}/{one}" for one in names]
         gel = f"bgs/digit_{finger}.png"
         # the last of Euler's angles "xyz"
         yaw = np.degrees(np.arctan2(turns[:, 1, 0], turns[:, 0, 0]))
@@ -171,29 +171,29 @@ def _add_bag(index: DatasetIndex, part: str, folder: str, bag: str) -> None:
 def _list(path: Path) -> list[Any]:
     frames = common.read_pickle(path)
     if not isinstance(frames, list):
-        raise DatasetError(f"{path} is no list of pictures; download it again")
+        raise DatasetError(f"{path} is no list of images; download it again")
     return frames
 
 
-def _picture(pictures: Export, frame: Any, name: str, path: Path) -> str:
-    """Write a frame of a pickle, an encoded picture or an array, and return the name of its
+def _image(images: Export, frame: Any, name: str, path: Path) -> str:
+    """Write a frame of a pickle, an encoded image or an array, and return the name of its
     file.
     """
     if isinstance(frame, bytes):
         name += next((end for magic, end in _MAGIC.items() if frame.startswith(magic)), ".png")
-        pictures.save(name, frame)
+        images.save(name, frame)
         return name
-    picture = np.asarray(frame)
-    if picture.dtype != np.uint8 or picture.ndim != 3:
-        raise DatasetError(f"frame {name} of {path} is no picture; download the data again")
-    pictures.save(f"{name}.png", picture)
+    image = np.asarray(frame)
+    if image.dtype != np.uint8 or image.ndim != 3:
+        raise DatasetError(f"frame {name} of {path} is no image; download the data again")
+    images.save(f"{name}.png", image)
     return f"{name}.png"
 
 
 def _touchd(index: DatasetIndex) -> None:
     """ToucHD's forces: <obj41_speed..>/<sensor>/image_<n>.png and all_data_direction.json.
 
-    The table has [number, f_x, f_y, f_z] of every picture of an object, speed and sensor. f_z is
+    The table has [number, f_x, f_y, f_z] of every image of an object, speed and sensor. f_z is
     turned, so that pressing is positive. image_1 is the background. Objects of AnyTouch 2's probe
     keep its split, others are by hash.
     """
@@ -216,7 +216,7 @@ def _touchd(index: DatasetIndex) -> None:
                 raise DatasetError(
                     f"{table}, {place}: {error}; each row is [number, f_x, f_y, f_z]"
                 ) from None
-            index.skip("picture of the table that is not on disk", place, len(rows) - len(kept))
+            index.skip("image of the table that is not on disk", place, len(rows) - len(kept))
             index.add(
                 [f"{place}/image_{row[0]}.png" for row in kept],
                 sensor=sensor,
@@ -247,13 +247,13 @@ def _freetacman(index: DatasetIndex) -> None:
         for name in (name for name in files if name.endswith(".mp4")):
             stem = Path(name).stem
             if not any(key in stem for key in wanted):
-                index.skip("film of another camera", f"{folder}/{name}")
+                index.skip("video of another camera", f"{folder}/{name}")
                 continue
-            index.need_export(f"{name} and other films")
+            index.need_export(f"{name} and other videos")
             try:
                 place = export_video(index, f"{folder}/{name}".lstrip("/"))
             except ImageError as error:
-                index.skip("film that cannot be read", str(error))
+                index.skip("video that cannot be read", str(error))
                 continue
             frames = index.frames(place)
             times: Any = _times(index, index.root / folder / f"{stem}_timestamps.txt", len(frames))
@@ -303,11 +303,11 @@ def _poses(index: DatasetIndex, path: Path, count: int) -> dict[str, list[Any]]:
 
 
 def _times(index: DatasetIndex, path: Path, count: int) -> list[float] | None:
-    """Return the time stamps of a film, one a line, None if there are not `count` of them."""
+    """Return the time stamps of a video, one a line, None if there are not `count` of them."""
     try:
         times = [float(line.split()[-1]) for line in path.read_text().splitlines() if line.strip()]
     except (OSError, ValueError, IndexError):
-        index.skip("film without readable time stamps (no column time)", str(path))
+        index.skip("video without readable time stamps (no column time)", str(path))
         return None
     if len(times) == count:
         return times

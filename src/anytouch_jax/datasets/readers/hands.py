@@ -1,4 +1,4 @@
-"""Touches by hand, with photographs of the same place: Touch and Go, TVL with SSVTP, and TacQuad.
+"""Touches by hand, with RGB images of the same place: Touch and Go, TVL with SSVTP, and TacQuad.
 
 Layouts are those of the authors' code, of AnyTouch's loaders and of data set cards. None states a
 licence of its data.
@@ -36,7 +36,7 @@ Listed = dict[str, dict[int, dict[str, Any]]]
 HCT = ("data1", "data2", "data3")
 FRAME = r"(\d+)-[\d.e+-]+\.(?:jpe?g|png)"
 SPARE = "digit_background.png"
-TOUCH_SIZE = {240, 320}  # a DIGIT's picture, upright or lying
+TOUCH_SIZE = {240, 320}  # a DIGIT's image, upright or lying
 THUMB = 16
 MARGIN = 0.3  # of correlations: a difference that is no chance
 Sides = tuple[Frames, Frames]  # touch and vision
@@ -49,7 +49,7 @@ ON_DISK = {"shuttlecock": "yumaoqiu"}  # folder -> its name in TacQuad's list, t
 def _touch_and_go(index: DatasetIndex) -> None:
     """People touch objects with a GelSight: `dataset/<video>/gelsight_frame/<10 digits>.jpg`.
 
-    The photograph of the same moment has the same name in `video_frame/`. `label.txt` names every
+    The RGB image of the same moment has the same name in `video_frame/`. `label.txt` names every
     contact frame. Frames come from videos by the dataset's extract_frame.py. Raises DatasetError
     without the lists of the task.
 
@@ -156,7 +156,7 @@ def _add_video(index: DatasetIndex, folder: str, listed: dict[int, dict[str, Any
                 frame_index=run,
                 sequence=f"{Path(folder).name}/{run[0]}",
                 split=lists[0].get(task, unlisted),
-                image_path=index.photographs(f"{folder}/video_frame", names, photos),
+                image_path=index.rgb_images(f"{folder}/video_frame", names, photos),
                 background_path=before and f"{folder}/gelsight_frame/{before}",
                 downstream_test=[test or None for test in tests],
                 **{
@@ -182,7 +182,7 @@ def _runs(numbers: list[int], together: Callable[[int, int], bool]) -> list[list
 
 
 def _ssvtp(index: DatasetIndex) -> None:
-    """A robot presses a DIGIT on textiles and photographs the place.
+    """A robot presses a DIGIT on textiles and RGB images the place.
 
     `caption_id` is of TacQuad's download.
     """
@@ -192,7 +192,7 @@ def _ssvtp(index: DatasetIndex) -> None:
     frames = index.frames(f"{base}images_tac", r"image_(\d+)_tac\.(?:jpe?g|png)")
     photos = index.frames(f"{base}images_rgb", r"image_(\d+)_rgb\.(?:jpe?g|png)")
     names = [photos.get(number, "") for number in frames]
-    index.skip("photograph without touch", "images_rgb", len(photos.keys() - frames.keys()))
+    index.skip("RGB image without touch", "images_rgb", len(photos.keys() - frames.keys()))
     tests, captions = index.read_captions(base, lambda path: Path(path).name)
     index.add(
         [f"{base}images_tac/{name}" for name in frames.values()],
@@ -203,7 +203,7 @@ def _ssvtp(index: DatasetIndex) -> None:
             ("test" if name in tests else "train") if tests else index.split_of(str(number))
             for number, name in frames.items()
         ],
-        image_path=index.photographs(f"{base}images_rgb", names, set(photos.values())),
+        image_path=index.rgb_images(f"{base}images_rgb", names, set(photos.values())),
         text=[captions.get(name) for name in frames.values()],
         caption_id=[f"ssvtp_{number}" for number in frames],
     )
@@ -222,7 +222,7 @@ def _tvl(index: DatasetIndex) -> None:
     test.csv, else by hash.
 
     Some recordings have the two folders swapped (reported to the authors, who point to a corrected
-    copy). They are read the other way round, if `_swapped` is certain. It opens two pictures of
+    copy). They are read the other way round, if `_swapped` is certain. It opens two images of
     each recording, and no others.
     """
     base = index.find_folder("tvl_dataset/hct", "hct", "", inside=HCT)
@@ -299,7 +299,7 @@ def _add_part(
             frame_index=list(pair[touch]),
             sequence=[f"{place}/test" if split == "test" and tests else place for split in splits],
             split=splits,
-            image_path=index.photographs(folders[place][vision], names, set(pair[vision].values())),
+            image_path=index.rgb_images(folders[place][vision], names, set(pair[vision].values())),
             background_path=[on_disk.get(_key(path), default) for path in named],
             text=[captions.get(key) for key in keys],
             **{"label.contact": [None if one is None else int(one) for one in is_contact]},
@@ -313,7 +313,7 @@ def _report_lost(
 ) -> None:
     """Report backgrounds that a contact list names and that are not on disk.
 
-    The picture for the whole part (SPARE) takes their place where it is there, and is named itself
+    The image for the whole part (SPARE) takes their place where it is there, and is named itself
     by frames without a background.
     """
     lost = []
@@ -356,7 +356,7 @@ def _hct_contact(index: DatasetIndex, folder: str) -> tuple[set[str] | None, dic
 
 
 def _swapped(first: Mapping[str, Sequence[Path]]) -> tuple[set[str], set[str]]:
-    """Return the recordings whose pictures (tactile, vision) are swapped, and those where that
+    """Return the recordings whose images (tactile, vision) are swapped, and those where that
     cannot be known.
 
     They are known by size, if only one of the two has a DIGIT's. Else touch is the side that is
@@ -367,14 +367,14 @@ def _swapped(first: Mapping[str, Sequence[Path]]) -> tuple[set[str], set[str]]:
     thumbs = {}
     for place, paths in first.items():
         try:
-            pictures = [decode(path) for path in paths]
+            images = [decode(path) for path in paths]
         except ImageError:
             continue
-        is_touch = [set(picture.shape[:2]) == TOUCH_SIZE for picture in pictures]
+        is_touch = [set(image.shape[:2]) == TOUCH_SIZE for image in images]
         if is_touch == [False, True]:
             swapped.add(place)
         elif is_touch != [True, False]:
-            thumbs[place] = [_thumb(picture).ravel() for picture in pictures]
+            thumbs[place] = [_thumb(image).ravel() for image in images]
     places = np.array(list(thumbs))
     count = len(thumbs)
     if count < 3:
@@ -397,13 +397,13 @@ def _swapped(first: Mapping[str, Sequence[Path]]) -> tuple[set[str], set[str]]:
     return swapped | set(places[rest[fewer]].tolist()), set()
 
 
-def _thumb(picture: np.ndarray) -> np.ndarray:
-    """Return means over THUMB x THUMB cells of a lying picture, f32, with a faint ramp so that no
-    picture is flat.
+def _thumb(image: np.ndarray) -> np.ndarray:
+    """Return means over THUMB x THUMB cells of a lying image, f32, with a faint ramp so that no
+    image is flat.
     """
-    if picture.shape[0] > picture.shape[1]:
-        picture = np.rot90(picture)
-    cells = cv2.resize(picture, (THUMB, THUMB), interpolation=cv2.INTER_AREA).astype(np.float32)
+    if image.shape[0] > image.shape[1]:
+        image = np.rot90(image)
+    cells = cv2.resize(image, (THUMB, THUMB), interpolation=cv2.INTER_AREA).astype(np.float32)
     return cells + np.linspace(0, 1e-3, cells.size, dtype=np.float32).reshape(cells.shape)
 
 
@@ -411,14 +411,14 @@ def _tacquad(index: DatasetIndex) -> None:
     """The same place of an object by four sensors:
     `data_{indoor,outdoor}/<item>/{gelsight,digit,duragel}/<n>.png`.
 
-    `gelsight` is the GelSight Mini. Photographs are `img_{gelsight,digit,duragel}/<n>.png`.
+    `gelsight` is the GelSight Mini. RGB images are `img_{gelsight,digit,duragel}/<n>.png`.
     `contact_<subset>.csv` has no header: item, then first and last contact frame of gelsight,
     digit, duragel. Assumed: the fine subset has the same layout (`data_fine`), and further columns
     are Tac3D's, whose force fields are counted and left out. Raises DatasetError for a subset
     without its list.
 
     * Contact frames get the item's split, the others `background` (label.contact 0). The first
-      frame of a recording is its background if contact begins later. The photograph is that of the
+      frame of a recording is its background if contact begins later. The RGB image is that of the
       same fraction of the recording.
     * `touch` is the item, equal for all sensors, and `caption_id` the name of its caption in the
       authors' download.
@@ -512,7 +512,7 @@ def _add_item(
             sensor=sensor,
             sequence=path,
             frame_index=list(frames),
-            image_path=index.photographs(f"{place}/img_{folder}", names, set(photos.values())),
+            image_path=index.rgb_images(f"{place}/img_{folder}", names, set(photos.values())),
             background_path=f"{path}/{frames[start]}"
             if frames and start < first and not contact[0]
             else None,

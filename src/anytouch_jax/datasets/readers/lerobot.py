@@ -51,7 +51,7 @@ def _lerobot(index: DatasetIndex) -> None:
     dataset = _read_info(index)
     episodes = {int(row["episode_index"]): row for row in _parquet_rows(index, "meta/episodes/")}
     splits = _stated_splits(index, dataset.info, episodes)
-    folders = {key: _export_films(index, dataset.info, key, episodes) for key in dataset.videos}
+    folders = {key: _export_videos(index, dataset.info, key, episodes) for key in dataset.videos}
     rows_of, labels = _read_rows(index, dataset)
     first = 0
     for path, rows in rows_of.items():
@@ -67,7 +67,7 @@ def _lerobot(index: DatasetIndex) -> None:
                     f"{folders[key][number]}/frame-{at:06d}.png"
                     for number, at in zip(episode, frame, strict=True)
                 ]
-            else:  # the pictures are cells of the table
+            else:  # the images are cells of the table
                 paths = [f"{path}/{key}/{at}" for at in range(len(rows))]
             index.add(
                 paths,
@@ -218,16 +218,16 @@ def _tasks(index: DatasetIndex) -> dict[int, str]:
     return {int(row.pop("task_index")): str(next(iter(row.values()))) for row in rows}
 
 
-def _export_films(
+def _export_videos(
     index: DatasetIndex, info: dict[str, Any], key: str, episodes: dict[int, dict[str, Any]]
 ) -> dict[int, str]:
-    """Write the episodes of a camera's films as PNG, and return their folders.
+    """Write the episodes of a camera's videos as PNG, and return their folders.
 
     Raises DatasetError.
     """
-    index.need_export(f"films of {key}")
+    index.need_export(f"videos of {key}")
     fps = float(info["fps"])
-    films = dict[str, list[tuple[int, int, int]]]()
+    videos = dict[str, list[tuple[int, int, int]]]()
     folders: dict[int, str] = {}
     for number, row in episodes.items():
         try:
@@ -237,15 +237,15 @@ def _export_films(
                 video_key=key, chunk_index=int(chunk), file_index=int(file)
             )
             first = round(float(row[f"videos/{key}/from_timestamp"]) * fps)
-            films.setdefault(path, []).append((first, int(row["length"]), number))
+            videos.setdefault(path, []).append((first, int(row["length"]), number))
         except (KeyError, TypeError, ValueError) as error:
             raise DatasetError(
-                f"{index.root}: meta/episodes says nothing of the film of {key}: {error}"
+                f"{index.root}: meta/episodes says nothing of the video of {key}: {error}"
             ) from None
-    for path, parts in films.items():
-        film = index.root / path
-        if not film.is_file():
-            raise DatasetError(f"there is no film {film}; download all of the data set")
+    for path, parts in videos.items():
+        video = index.root / path
+        if not video.is_file():
+            raise DatasetError(f"there is no video {video}; download all of the data set")
         with ExitStack() as stack:
             exports = {
                 number: stack.enter_context(
@@ -253,36 +253,36 @@ def _export_films(
                         index,
                         f"images/{key}/episode-{number:06d}",
                         f"{key}, episode {number}",
-                        [film],
+                        [video],
                         [first, length],
                     )
                 )
                 for first, length, number in parts
             }
             if any(export.is_new for export in exports.values()):
-                _write_episodes(index, film, sorted(parts), exports)
+                _write_episodes(index, video, sorted(parts), exports)
         folders |= {number: export.folder for number, export in exports.items()}
     return folders
 
 
 def _write_episodes(
-    index: DatasetIndex, film: Path, parts: list[tuple[int, int, int]], exports: dict[int, Export]
+    index: DatasetIndex, video: Path, parts: list[tuple[int, int, int]], exports: dict[int, Export]
 ) -> None:
     last = max(first + length for first, length, _ in parts)
     count = 0
     try:
-        for count, picture in enumerate(
-            index.tracked(frames_from_video(film), "frames written", last), 1
+        for count, image in enumerate(
+            index.tracked(frames_from_video(video), "frames written", last), 1
         ):
             for first, length, number in parts:
                 if first <= count - 1 < first + length:
-                    exports[number].save(f"frame-{count - 1 - first:06d}.png", picture)
+                    exports[number].save(f"frame-{count - 1 - first:06d}.png", image)
             if count == last:
                 break
     except ImageError as error:
         raise DatasetError(f"{error}; or download it again") from None
     if count < last:
-        raise DatasetError(f"{film} has {count} frames and the episodes {last}; download it again")
+        raise DatasetError(f"{video} has {count} frames and the episodes {last}; download it again")
 
 
 def camera_names(cameras: Sequence[str]) -> list[str]:

@@ -1,9 +1,9 @@
-"""Recordings of your own: a folder of pictures is a recording, in ROOT or at any depth below it.
+"""Recordings of your own: a folder of images is a recording, in ROOT or at any depth below it.
 
     mine/mug/pour_1/000.png ...         the object is the first folder, the recording is the folder
     mine/mug/pour_2.mp4                 with `--export` its frames are written into a folder of its
     name mine/mug/background.png             the untouched gel of every recording in or below this
-    folder mine/mug/photo.jpg                  a photograph of the touched object, for the same
+    folder mine/mug/photo.jpg                  an RGB image of the touched object, for the same
     recordings mine/mug/caption.txt                a caption, for the same recordings
 
 Names decide the order and the numbers of frames (`data.names`). If numbers repeat with other words
@@ -34,7 +34,7 @@ from anytouch_jax.data.manifest.schema import EMPTY, REQUIRED, typed_label
 from anytouch_jax.data.names import (
     frame_numbers,
     frame_order,
-    looks_like_film,
+    looks_like_video,
     natural,
     split_series,
 )
@@ -52,10 +52,10 @@ PLAIN_COLUMNS = ("unit", "touch", "text")
 
 
 _TINY = (32, 24)
-# largest difference of neighbouring pictures of a film, as a share of that of any two
-_FILM = 0.75
-_SLOW = 5  # seconds between the files of single pictures
-_STILL = 1.0  # grey levels: pictures that differ by less show nothing
+# largest difference of neighbouring images of a video, as a fraction of that of any two
+_VIDEO = 0.75
+_SLOW = 5  # seconds between the files of single images
+_STILL = 1.0  # grey levels: images that differ by less show nothing
 
 
 class _Place(NamedTuple):
@@ -81,15 +81,15 @@ class _Recording(NamedTuple):
 
 
 def read(index: DatasetIndex) -> None:
-    """Add every folder of pictures.
+    """Add every folder of images.
 
     Raises UserError without a sensor, and for options that exclude each other.
     """
     root = index.root
     options = index.options
     sensor = index.need_sensor()
-    if options.singles and options.films:
-        raise UserError("--singles and --films exclude each other; give one of them, or none")
+    if options.singles and options.videos:
+        raise UserError("--singles and --videos exclude each other; give one of them, or none")
     if options.export:
         _export_videos(index)
     found: dict[str, dict[str, list[str]]] = {}  # folder -> finger -> names
@@ -101,7 +101,7 @@ def read(index: DatasetIndex) -> None:
         )
         if folder.rpartition("/")[2].lower() in (BACKGROUND, PHOTO):
             index.skip(
-                f"folder called {BACKGROUND} or {PHOTO}, where one picture is expected", folder
+                f"folder called {BACKGROUND} or {PHOTO}, where one image is expected", folder
             )
             continue
         if not options.export:
@@ -114,14 +114,14 @@ def read(index: DatasetIndex) -> None:
         for folder, fingers in found.items()
         for unit, names in fingers.items()
     ]
-    films = _films(index, recordings)
-    sequences = _sequences([(one.place, one.unit, one.names) for one in recordings], films)
+    videos = _videos(index, recordings)
+    sequences = _sequences([(one.place, one.unit, one.names) for one in recordings], videos)
     numbers = frame_numbers if options.order == "names" else lambda names: list(range(len(names)))
-    # of every row: the recording that is never split, a folder or a single picture
+    # of every row: the recording that is never split, a folder or a single image
     parts: list[str] = []
     # of every row: the split that a folder decides
     given: list[str | None] = []
-    for one, is_film, sequence in zip(recordings, films, sequences, strict=True):
+    for one, is_video, sequence in zip(recordings, videos, sequences, strict=True):
         paths = [f"{one.folder}/{name}".lstrip("/") for name in one.names]
         index.add(
             paths,
@@ -130,62 +130,62 @@ def read(index: DatasetIndex) -> None:
             object=one.place.object,
             dataset=root.name,
             sequence=sequence,
-            frame_index=numbers(one.names) if is_film else 0,
+            frame_index=numbers(one.names) if is_video else 0,
             **shared[one.folder],
         )
-        parts += [one.folder] * len(paths) if is_film else paths
+        parts += [one.folder] * len(paths) if is_video else paths
         given += [one.place.split] * len(paths)
     if recordings:
-        index.notes.insert(0, _sentence([one.place for one in recordings], films))
+        index.notes.insert(0, _sentence([one.place for one in recordings], videos))
         if options.labels is not None:
             _join_labels(index, options.labels.expanduser(), parts)
         _assign_splits(
-            index, parts, given, "recording" if 2 * sum(films) < len(films) else "object"
+            index, parts, given, "recording" if 2 * sum(videos) < len(videos) else "object"
         )
 
 
-def _films(index: DatasetIndex, recordings: list[_Recording]) -> list[bool]:
-    """Return which recordings are videos as pictures, and put their names into order.
+def _videos(index: DatasetIndex, recordings: list[_Recording]) -> list[bool]:
+    """Return which recordings are videos as images, and put their names into order.
 
-    Names decide, or a few pictures where every object has one folder. --singles, --films and
+    Names decide, or a few images where every object has one folder. --singles, --videos and
     --order times decide for all.
     """
     options = index.options
-    films = _films_by_names(index, recordings)
-    if options.singles or options.films or options.order == "times":
-        return films
-    several = [at for at, one in enumerate(recordings) if films[at] and len(one.names) > 1]
+    videos = _videos_by_names(index, recordings)
+    if options.singles or options.videos or options.order == "times":
+        return videos
+    several = [at for at, one in enumerate(recordings) if videos[at] and len(one.names) > 1]
     objects = [
         (recordings[at].place.split, recordings[at].place.object, recordings[at].unit)
         for at in several
     ]
-    # Where each object has one folder, its pictures may as well be single touches with numbers for
+    # Where each object has one folder, its images may as well be single touches with numbers for
     # names, so a few of them are opened.
     if len(set(objects)) == len(objects):
-        if not _move_like_films(index, [recordings[at] for at in several]):
-            films = [is_film and at not in several for at, is_film in enumerate(films)]
+        if not _move_like_videos(index, [recordings[at] for at in several]):
+            videos = [is_video and at not in several for at, is_video in enumerate(videos)]
         elif len({name for _, name, _ in objects}) > 1:
             index.notes.append(
-                "each object has one recording; if its pictures are single touches, give --singles"
+                "each object has one recording; if its images are single touches, give --singles"
             )
-    alone = [one.folder for one, is_film in zip(recordings, films, strict=True) if not is_film]
+    alone = [one.folder for one, is_video in zip(recordings, videos, strict=True) if not is_video]
     if alone:
         where = f"{len(alone)} folders (first: {alone[0] or '.'})"
         index.notes.append(
-            f"the pictures of {where} do not look like a film: each is a single touch; --films "
+            f"the images of {where} do not look like a video: each is a single touch; --videos "
             "makes a recording of each folder"
         )
-    return films
+    return videos
 
 
-def _films_by_names(index: DatasetIndex, recordings: list[_Recording]) -> list[bool]:
-    """Return which recordings are videos by the names of their pictures, which are put into order.
+def _videos_by_names(index: DatasetIndex, recordings: list[_Recording]) -> list[bool]:
+    """Return which recordings are videos by the names of their images, which are put into order.
 
     A note says where neither names nor times of files give an order.
     """
     options = index.options
     by_time = options.order == "times"
-    films = []
+    videos = []
     unclear = []
     for one in recordings:
         one.names[:], is_clear = frame_order(one.names)
@@ -194,10 +194,10 @@ def _films_by_names(index: DatasetIndex, recordings: list[_Recording]) -> list[b
             times = {file.name: os.stat(file).st_mtime_ns for file in files}
             one.names.sort(key=times.__getitem__)
             is_clear = len(set(times.values())) == len(times)
-        looks_like_one = looks_like_film(one.names) or len(one.names) == 1
-        is_film = not options.singles and (options.films or by_time or looks_like_one)
-        films.append(is_film)
-        if is_film and not is_clear:
+        looks_like_one = looks_like_video(one.names) or len(one.names) == 1
+        is_video = not options.singles and (options.videos or by_time or looks_like_one)
+        videos.append(is_video)
+        if is_video and not is_clear:
             unclear.append(one.folder or ".")
     if unclear:
         what = "times of the files" if by_time else "names"
@@ -206,14 +206,14 @@ def _films_by_names(index: DatasetIndex, recordings: list[_Recording]) -> list[b
             f"the {what} do not order {len(unclear)} recordings clearly (first: "
             f"{unclear[0]}){advice}"
         )
-    return films
+    return videos
 
 
-def _move_like_films(index: DatasetIndex, recordings: list[_Recording]) -> bool:
-    """Return whether pictures change as a video does, in at most eight recordings."""
+def _move_like_videos(index: DatasetIndex, recordings: list[_Recording]) -> bool:
+    """Return whether images change as a video does, in at most eight recordings."""
     count = len(recordings)
     spread = np.unique(np.linspace(0, count - 1, min(8, count)).astype(int))
-    return _moves_like_film(
+    return _moves_like_video(
         [
             [index.root / recordings[at].folder / name for name in recordings[at].names]
             for at in spread
@@ -307,7 +307,7 @@ def _group_values(table: dict[str, list[Any]], by: str) -> list[Any]:
 
 
 def _shared_cells(root: Path, folder: str, files: list[str]) -> dict[str, Any]:
-    """Return the background, photograph and caption in a folder.
+    """Return the background, RGB image and caption in a folder.
 
     Raises DatasetError for a caption that is no text.
     """
@@ -372,16 +372,16 @@ def _place(names: tuple[str, ...], shared: int) -> _Place:
 
 
 def _sequences(
-    recordings: Sequence[tuple[_Place, str, list[str]]], films: Sequence[bool]
+    recordings: Sequence[tuple[_Place, str, list[str]]], videos: Sequence[bool]
 ) -> list[list[str]]:
-    """Return the distinct sequence of every picture, its own if it is no film, with a split or
+    """Return the distinct sequence of every image, its own if it is no video, with a split or
     number.
     """
     names = [
-        [f"{place.name}/{unit}"] * len(pictures)
-        if is_film
-        else [f"{place.name}/{picture}" for picture in pictures]
-        for (place, unit, pictures), is_film in zip(recordings, films, strict=True)
+        [f"{place.name}/{unit}"] * len(images)
+        if is_video
+        else [f"{place.name}/{image}" for image in images]
+        for (place, unit, images), is_video in zip(recordings, videos, strict=True)
     ]
     names = [[name.strip("/") or "." for name in one] for one in names]
     splits = [place.split for place, *_ in recordings]
@@ -398,14 +398,14 @@ def _sequences(
     return names
 
 
-def _sentence(places: Sequence[_Place], films: Sequence[bool]) -> str:
-    """Return how the tree was understood: its levels, the folders of splits, and what a picture
+def _sentence(places: Sequence[_Place], videos: Sequence[bool]) -> str:
+    """Return how the tree was understood: its levels, the folders of splits, and what an image
     is.
     """
     forms: Counter[str] = Counter()
     words: dict[str, str] = {}
-    for place, is_film in zip(places, films, strict=True):
-        last = "frames" if is_film else "<touch>"
+    for place, is_video in zip(places, videos, strict=True):
+        last = "frames" if is_video else "<touch>"
         form = [
             kind
             for at, kind in enumerate(place.kinds)
@@ -423,8 +423,8 @@ def _sentence(places: Sequence[_Place], films: Sequence[bool]) -> str:
     return f"folders are understood as {first}{more}" + (f"; {named}" if named else "")
 
 
-def _moves_like_film(folders: Sequence[Sequence[Path]]) -> bool:
-    """Return whether neighbouring pictures are more alike than others, by a few, and not stored
+def _moves_like_video(folders: Sequence[Sequence[Path]]) -> bool:
+    """Return whether neighbouring images are more alike than others, by a few, and not stored
     seconds apart.
     """
     near = list[float]()
@@ -433,7 +433,7 @@ def _moves_like_film(folders: Sequence[Sequence[Path]]) -> bool:
     for paths in folders:
         starts = np.unique(np.linspace(0, len(paths) - 2, 4).astype(int))
         try:
-            pictures = {
+            decoded = {
                 at: images.decode(paths[at])
                 for at in sorted({*starts.tolist(), *(starts + 1).tolist()})
             }
@@ -443,7 +443,7 @@ def _moves_like_film(folders: Sequence[Sequence[Path]]) -> bool:
         except (images.ImageError, OSError):
             continue
         tiny = {
-            at: cv2.resize(one, _TINY, interpolation=cv2.INTER_AREA) for at, one in pictures.items()
+            at: cv2.resize(one, _TINY, interpolation=cv2.INTER_AREA) for at, one in decoded.items()
         }
         tiny = {at: one.mean(axis=2).astype(np.float32) for at, one in tiny.items()}
         near += [float(np.abs(tiny[at] - tiny[at + 1]).mean()) for at in starts]
@@ -454,13 +454,13 @@ def _moves_like_film(folders: Sequence[Sequence[Path]]) -> bool:
     is_alike = (
         not far
         or float(np.mean(far)) < _STILL
-        or float(np.mean(near)) < _FILM * float(np.mean(far))
+        or float(np.mean(near)) < _VIDEO * float(np.mean(far))
     )
     return is_alike and not is_slow
 
 
 def _fingers(index: DatasetIndex, files: list[str], folder: str) -> dict[str, list[str]]:
-    """Return the pictures of a folder by finger; arrays only if there is nothing else."""
+    """Return the images of a folder by finger; arrays only if there is nothing else."""
     names = []
     for name in sorted(files, key=natural):
         path = f"{folder}/{name}".lstrip("/")
@@ -469,10 +469,10 @@ def _fingers(index: DatasetIndex, files: list[str], folder: str) -> dict[str, li
         if suffix in SUFFIXES and stem not in (BACKGROUND, PHOTO):
             names.append(name)
         elif suffix not in (*SUFFIXES, *MANIFESTS, *VIDEOS) and name.lower() != CAPTION:
-            index.skip("file that is no picture", path)
+            index.skip("file that is no image", path)
     arrays = [name for name in names if Path(name).suffix.lower() == ".npy"]
     if arrays and len(arrays) < len(names):
-        index.skip("array next to pictures", f"{folder}/{arrays[0]}", len(arrays))
+        index.skip("array next to images", f"{folder}/{arrays[0]}", len(arrays))
         names = [name for name in names if name not in arrays]
     if names:
         return split_series(names)
@@ -498,25 +498,24 @@ def _export_videos(index: DatasetIndex) -> None:
 
 
 def _skip_videos(index: DatasetIndex, folder: str, folders: list[str], files: list[str]) -> None:
-    """Report the videos of a folder without pictures, or with those of an earlier video."""
+    """Report the videos of a folder without images, or with those of an earlier video."""
     for name in filter(_is_video, files):
         path = f"{folder}/{name}".lstrip("/")
         place, record = find_export(index.root, path.removesuffix(Path(name).suffix), name)
         if record is not None and not is_current(record, [index.root / path]):
             index.skip(
-                f"video that was changed after its pictures in {place} (--export writes them "
-                "again)",
+                f"video that was changed after its images in {place} (--export writes them again)",
                 path,
             )
         elif record is None and Path(name).stem not in folders:
-            index.skip("video (--export writes its frames as pictures)", path)
+            index.skip("video (--export writes its frames as images)", path)
 
 
 def _join_labels(index: DatasetIndex, path: Path, parts: list[str]) -> None:
     """Join the CSV table `path` to the rows by object or sequence; a line of the sequence goes
     first.
 
-    A sequence may be named by its folder or picture too, in any Unicode form. Lines and recordings
+    A sequence may be named by its folder or image too, in any Unicode form. Lines and recordings
     without the other are skipped. Raises DatasetError for a table that is missing, has no key, or
     has a column or a key twice.
     """
@@ -615,6 +614,16 @@ READERS = {
         "<object>/<recording>/0.png",
         "nothing, unless their owner asks for it",
         "as their owner says",
-        uses=("val", "test", "split_by", "sensor", "labels", "export", "singles", "films", "order"),
+        uses=(
+            "val",
+            "test",
+            "split_by",
+            "sensor",
+            "labels",
+            "export",
+            "singles",
+            "videos",
+            "order",
+        ),
     )
 }

@@ -50,7 +50,7 @@ PLACES = ("obj1.0/", "obj2.0/touch/", "touch/", "")
 # folder -> (folder, files) of the camera views in it
 Views = dict[str, list[tuple[str, list[str]]]]
 PHASES = ("before", "during", "after")
-PICTURES = {
+IMAGES = {
     **{f"kinectA_rgb_{phase}": (f"vision_{phase}", "") for phase in PHASES},
     **{
         f"gelsight{finger}_{phase}": (f"touch_{phase}", f"_{finger}")
@@ -63,7 +63,7 @@ PICTURES = {
 def _visgel(index: DatasetIndex) -> None:
     """A robot pokes 195 objects with a GelSight while a camera watches.
 
-    AnyTouch's code has the layout of READERS, with the photograph of the same moment under the same
+    AnyTouch's code has the layout of READERS, with the RGB image of the same moment under the same
     path in `vision`. T3 has `data_seen` and `data_unseen` with two levels of folders as downloaded,
     where `frame0000.jpg` is the touch-free reference. Assumed: the same `touch` / `vision` pair
     within these. `data_unseen` is the test part.
@@ -89,7 +89,7 @@ def _visgel(index: DatasetIndex) -> None:
                     key=inside,
                     sensor="gelsight",
                     sequence=folder,
-                    image_path=index.photographs(vision, frames.values(), set(on_disk)),
+                    image_path=index.rgb_images(vision, frames.values(), set(on_disk)),
                     background_path=f"{folder}/{frames[0]}" if 0 in frames else None,
                 )
 
@@ -238,8 +238,8 @@ def _rendered(index: DatasetIndex) -> None:
     AnyTouch's code has `obj1.0/<id>/<n>.png` and `obj2.0/touch/<id>/<n>.png`, with
     `obj2.0/label.json` (id -> material number, without names) and `obj2.0/split.json` (train, test:
     lists of [id, n]) for both. Ids up to 100 are 1.0, and 2.0 leaves them out. The split is the
-    benchmark's and by picture, so an object is in train and test. Every picture is a sequence.
-    Pictures in no list are `unused`. Raises DatasetError without label.json or split.json.
+    benchmark's and by image, so an object is in train and test. Every image is a sequence.
+    Images in no list are `unused`. Raises DatasetError without label.json or split.json.
     """
     ids = {
         place: [name for name in index.listing(place, count=False)[0] if name.isdecimal()]
@@ -272,9 +272,7 @@ def _rendered(index: DatasetIndex) -> None:
                 **{"label.material": labels.get(number)},
             )
             index.skip("id without a label (kept without)", folder, number not in labels)
-    index.skip(
-        "picture of split.json that is not on disk", str(next(iter(splits), "")), len(splits)
-    )
+    index.skip("image of split.json that is not on disk", str(next(iter(splits), "")), len(splits))
 
 
 def _objectfolder_lists(index: DatasetIndex) -> tuple[dict[int, int], dict[tuple[int, int], str]]:
@@ -308,10 +306,10 @@ def _real(index: DatasetIndex) -> None:
 
     T3 and Sparsh have `<object>/tactile_data/<trial>/0/gelsight/<n>.png`, AnyTouch the same under
     `tactile/`. T3 has `objectfolder_real_metadata.csv` with Index,Name,Material. The authors'
-    `contact_text_obj.csv` has touch frame, photograph and caption number, where both paths start
+    `contact_text_obj.csv` has touch frame, RGB image and caption number, where both paths start
     below `tactile/`. The names of the two camera folders are unknown. Assumed: they are siblings of
     `gelsight` with the same numbers. The first two by name are `image_path` and `image2_path`,
-    unless the list names the photograph. The object is the first number in the path.
+    unless the list names the RGB image. The object is the first number in the path.
     """
     base = index.find_folder("tactile", "real/tactile", "") or ""
     table = index.find_file(["objectfolder_real_metadata.csv"])
@@ -341,7 +339,7 @@ def _real(index: DatasetIndex) -> None:
         photos = [photo.rpartition("tactile/")[2] for photo in index.listed(inside, frames, 1)]
         captions = index.listed(inside, frames, 2)
         missing = sum(bool(photo) and photo not in on_disk for photo in photos)
-        index.skip("listed photograph that is not on disk (kept without)", inside, missing)
+        index.skip("listed RGB image that is not on disk (kept without)", inside, missing)
         first, second = _camera_views(index, base, views[inside.rpartition("/")[0]], list(frames))
         listed = [f"{base}{photo}" if photo in on_disk else None for photo in photos]
         index.add_recording(
@@ -362,7 +360,7 @@ def _real(index: DatasetIndex) -> None:
 def _camera_views(
     index: DatasetIndex, base: str, siblings: list[tuple[str, list[str]]], numbers: list[int]
 ) -> list[list[str | None]]:
-    """Return the pictures of the first two camera views (by name) with the numbers of the touch
+    """Return the images of the first two camera views (by name) with the numbers of the touch
     frames, else None.
     """
     views: list[list[str | None]] = []
@@ -378,7 +376,7 @@ def _feel(index: DatasetIndex) -> None:
 
     `feel.csv` has no header: object, n, success. `split_<k>.npy` is a pickled dict of train and
     test object lists, as `split_<k>.json` may be; without either the split is by hash. The original
-    files are `calandra_corl2017_*.h5`, of which `export` writes the pictures as PNG (needs `pip
+    files are `calandra_corl2017_*.h5`, of which `export` writes the images as PNG (needs `pip
     install h5py`). Raises DatasetError for them without it.
 
     * The split of a `during` frame is its object's. `before` (open fingers) is background, and the
@@ -438,7 +436,7 @@ def _add_grasp(
             file = f"touch_{phase}/{number}_{finger}.png"
             photo = f"vision_{phase}/{number}.png"
             if file not in files:
-                index.skip("picture of feel.csv that is not on disk", f"{folder}/{file}")
+                index.skip("image of feel.csv that is not on disk", f"{folder}/{file}")
                 continue
             index.add(
                 [f"{folder}/{file}"],
@@ -504,8 +502,8 @@ def export_grasps(root: Path, names: Sequence[str]) -> int:
                     )
                     obj = _object_name(obj)
                     number = numbers[obj] = numbers.get(obj, -1) + 1
-                    for key in PICTURES.keys() & grasp.keys():
-                        sub, ending = PICTURES[key]
+                    for key in IMAGES.keys() & grasp.keys():
+                        sub, ending = IMAGES[key]
                         _save_once(
                             root / obj / sub / f"{number}{ending}.png", np.asarray(grasp[key][()])
                         )
@@ -518,17 +516,17 @@ def export_grasps(root: Path, names: Sequence[str]) -> int:
     return len(lines)
 
 
-def _save_once(file: Path, picture: np.ndarray) -> None:
-    """Write a picture RGB u8 (h, w, 3) as PNG. Raises ValueError for a file that has another."""
-    data = encode(np.ascontiguousarray(picture))
+def _save_once(file: Path, image: np.ndarray) -> None:
+    """Write an image RGB u8 (h, w, 3) as PNG. Raises ValueError for a file that has another."""
+    data = encode(np.ascontiguousarray(image))
     if not file.is_file():
         atomic_write(file, data, sync=False)
     elif file.read_bytes() != data:
-        raise ValueError(f"{file} holds another picture; move it elsewhere")
+        raise ValueError(f"{file} holds another image; move it elsewhere")
 
 
 def _grasps(group: Any) -> Iterator[Any]:
-    """Yield every group with the pictures of a grasp, at any depth."""
+    """Yield every group with the images of a grasp, at any depth."""
     if "gelsightA_during" in group:
         yield group
         return

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from anytouch_jax.data.background.rule import UnitGels
+from anytouch_jax.data.background.rule import Backgrounds
 from anytouch_jax.encoder.arrays import Array
 from anytouch_jax.evaluate import feature_cache, probing, splits
 
@@ -38,7 +38,7 @@ def measure_head(table: Manifest, fitted: TaughtHead) -> dict[str, float]:
     """
     rows = fitted.rows
     pixels = feature_cache.pixel_components(
-        feature_cache.pixel_features(table, gels=UnitGels(table)), rows
+        feature_cache.pixel_features(table, backgrounds=Backgrounds(table)), rows
     )
     result = _accuracies(fitted.x, pixels, rows, np.isin(rows.labels, fitted.repeated))
     result["once"] = fitted.once

@@ -18,7 +18,7 @@ _NEAR = 40  # frames of a recording that may be nearer than the next recording, 
 
 
 class FeatureMap:
-    """A features file of `anytouch embed`, with the pictures of a table.
+    """A features file of `anytouch embed`, with the images of a table.
 
     It is the first of `tables` that has the rows of the file. Raises UserError for another file.
     """

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from anytouch_jax.data.background.contact import DEFAULT_THRESHOLD, THRESHOLDS
-from anytouch_jax.data.background.rule import UnitGels
+from anytouch_jax.data.background.rule import Backgrounds
 from anytouch_jax.encoder.arrays import Array, Pooling
 from anytouch_jax.encoder.linear_head import COVERAGE, FALSE_ALARMS, LinearHead
 from anytouch_jax.evaluate import heads, probing, splits
@@ -79,7 +79,7 @@ def fit_head(
     data, cut, _ = splits.check_rows(x, rows.labels, rows.groups, rows.split, tested=False)
     # Without rows for validation, the penalty is chosen on recordings that are left out in turn.
     penalty = splits.select_option(
-        heads.ProbeHead(), data, cut._replace(val=cut.val[:0]), "honest"
+        heads.ProbeHead(), data, cut._replace(val=cut.val[:0]), "grouped"
     ).option
     (model,) = data.fit(heads.ProbeHead(options=(penalty,)), cut.fit).models
     head = heads.linear_head(
@@ -91,7 +91,7 @@ def fit_head(
         fingerprint=encoder.fingerprint,
     )
     if encoder.subtracts:
-        head = replace(head, gels=UnitGels(table).pictures(ids))
+        head = replace(head, backgrounds=Backgrounds(table).images(ids))
     # the name of each recording
     recorded = dict(zip(rows.groups.tolist(), rows.labels.tolist(), strict=True))
     names, times = np.unique(list(recorded.values()), return_counts=True)

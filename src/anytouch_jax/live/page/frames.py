@@ -9,7 +9,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TYPE_CHECKING, NamedTuple
 
 from anytouch_jax.data.background.contact import DEFAULT_THRESHOLD, THRESHOLDS
-from anytouch_jax.data.background.rule import RunningGel, other_unit, same_unit
+from anytouch_jax.data.background.rule import RunningBackground, other_unit, same_unit
 from anytouch_jax.encoder.arrays import Array
 from anytouch_jax.live.page.layers import LAYERS, touch_layer
 from anytouch_jax.live.page.setup import Setup, make_setup, measure_last
@@ -17,14 +17,14 @@ from anytouch_jax.live.page.setup import Setup, make_setup, measure_last
 if TYPE_CHECKING:
     from anytouch_jax.data.transforms import Flip
     from anytouch_jax.encoder.encoder import Encoder
-    from anytouch_jax.encoder.linear_head import LinearHead
+    from anytouch_jax.encoder.linear_head import Head
     from anytouch_jax.encoder.measured import Fields
 
 _LAST = 8  # frames that are kept: a clip, and those that are read while it is embedded
 
 
 class Kept(NamedTuple):
-    """One of the last frames: its number, its picture as read, turned and prepared, and how."""
+    """One of the last frames: its number, its image as read, turned and prepared, and how."""
 
     number: int
     raw: Array
@@ -47,7 +47,7 @@ class FrameReader:
         self,
         encoder: Encoder,
         sensor: str,
-        head: Callable[[], LinearHead | None],
+        head: Callable[[], Head | None],
         log: Callable[[str], None],
     ) -> None:
         self.threshold = THRESHOLDS.get(sensor, DEFAULT_THRESHOLD)
@@ -79,7 +79,7 @@ class FrameReader:
         return touch_layer(one.turned, one.setup.small, self.threshold, LAYERS[0])[1]
 
     def warm_up(self, row: int) -> None:
-        """Compile what measures sensor `row`, and forget what it saw of an empty picture."""
+        """Compile what measures sensor `row`, and forget what it saw of an empty image."""
         setup = self._setup
         if setup.measure is not None:
             blank = self._encoder.blank
@@ -91,7 +91,7 @@ class FrameReader:
         last = kept[-1]
         if last.setup.measure is None:
             return None
-        # What came before the picture was turned is no motion.
+        # What came before the image was turned is no motion.
         clip = [one.prepared for one in kept if one.setup.is_turned_as(last.setup)]
         return measure_last(self._encoder, last.setup.measure, row, last.turned, clip)
 
@@ -108,26 +108,26 @@ class FrameReader:
         if self._kept:
             self.set_background(self._setup.turned(self._kept[-1].raw))
 
-    def set_background(self, picture: Array | None) -> None:
-        """Take a picture RGB u8 (h, w, 3) as the background, or None to estimate it again."""
+    def set_background(self, image: Array | None) -> None:
+        """Take an image RGB u8 (h, w, 3) as the background, or None to estimate it again."""
         with self._lock:
             now = self._setup
-            self._setup = make_setup(self._encoder, self._sensor, now.rotate, now.flip, picture)
+            self._setup = make_setup(self._encoder, self._sensor, now.rotate, now.flip, image)
 
-    def __call__(self, picture: Array) -> Array:
-        """Keep the picture of a frame, and return it for the encoder.
+    def __call__(self, image: Array) -> Array:
+        """Keep the image of a frame, and return it for the encoder.
 
         Frames come here one by one, from 0, so that they can be counted.
         """
         setup = self._setup
-        turned = setup.turned(picture)
+        turned = setup.turned(image)
         setup = self._find_gel(setup, turned)
         prepared = setup.preprocess(turned)
-        self._kept.append(Kept(self._count, picture, turned, prepared, setup))
+        self._kept.append(Kept(self._count, image, turned, prepared, setup))
         self._count += 1
         return prepared
 
-    def _find_gel(self, setup: Setup, picture: Array) -> Setup:
+    def _find_gel(self, setup: Setup, image: Array) -> Setup:
         """Look for the background by the rule of `data.background`.
 
         It is that of the head's sensor instance, or a running estimate.
@@ -136,20 +136,20 @@ class FrameReader:
         if running is None:
             return setup
         head = self._head()
-        if not self._count and head is not None and head.gels:
-            known = _known_gel(head.gels, picture, self._log)
+        if not self._count and head is not None and head.backgrounds:
+            known = _known_gel(head.backgrounds, image, self._log)
             if known is not None:
                 return self._replace(setup, known, None)
         # An estimate takes longer than a frame may be old, so another thread makes it.
         if self._looking is None or self._looking.done():
-            self._looking = self._looker.submit(running.add, picture)
-            if running.picture is None:
+            self._looking = self._looker.submit(running.add, image)
+            if running.image is None:
                 self._looking.result()
-        if running.picture is setup.gel:
+        if running.image is setup.gel:
             return setup
-        return self._replace(setup, running.picture, running)
+        return self._replace(setup, running.image, running)
 
-    def _replace(self, setup: Setup, gel: Array | None, running: RunningGel | None) -> Setup:
+    def _replace(self, setup: Setup, gel: Array | None, running: RunningBackground | None) -> Setup:
         """Return a setup with another background.
 
         It is used unless the page has asked for another meanwhile.
@@ -162,13 +162,14 @@ class FrameReader:
 
 
 def _known_gel(
-    gels: Mapping[str, Array], picture: Array, log: Callable[[str], None]
+    backgrounds: Mapping[str, Array], image: Array, log: Callable[[str], None]
 ) -> Array | None:
-    """Return the background of the sensor instance that a picture is of, if it is one of `gels`.
+    """Return the background of the sensor instance that an image is of, if it is one of
+    `backgrounds`.
 
-    `log` gets a sentence if the picture is of another instance.
+    `log` gets a sentence if the image is of another instance.
     """
-    known, why = same_unit(gels, picture)
+    known, why = same_unit(backgrounds, image)
     if known is not None and not why:
         return known
     log(other_unit(why))

@@ -1,4 +1,4 @@
-"""Layers of a tactile picture as the page shows them: difference, contact, depth, surface."""
+"""Layers of a tactile image as the page shows them: difference, contact, depth, surface."""
 
 from __future__ import annotations
 
@@ -8,7 +8,12 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
-from anytouch_jax.data.background.estimate import UntouchedGel, contact_score, scale_picture
+from anytouch_jax.data.background.estimate import (
+    UntouchedBackground,
+    contact_score,
+    scale_image,
+    without_islands,
+)
 from anytouch_jax.data.transforms import subtract_background
 from anytouch_jax.encoder.arrays import Array
 from anytouch_jax.errors import UserError
@@ -19,24 +24,24 @@ if TYPE_CHECKING:
 # of a touch, by which the page shows it
 LAYERS = ("frame", "difference", "contact", "depth", "surface")
 MEASURED = LAYERS[3:]  # those that an encoder measures
-SIDE = 640  # pixels of the long side of a picture on the page
-_SHARP = 480  # pixels of the long side of a picture with arrows, at least
-_SIDE = 72  # cells of a surface along the long side of the picture
+SIDE = 640  # pixels of the long side of an image on the page
+_SHARP = 480  # pixels of the long side of an image with arrows, at least
+_SIDE = 72  # cells of a surface along the long side of the image
 # Colours of contact: red and green of a pixel are halved and raised, blue only halved.
 _TINTED = (np.arange(256)[None, :, None] / 2 + (127, 60, 0)).astype(np.uint8)
 
 
-def scale_down(picture: Array, side: int = SIDE) -> Array:
-    """Return a picture whose long side has at most `side` pixels."""
-    if max(picture.shape[:2]) <= side:
-        return picture
-    return scale_picture(picture, side)
+def scale_down(image: Array, side: int = SIDE) -> Array:
+    """Return an image whose long side has at most `side` pixels."""
+    if max(image.shape[:2]) <= side:
+        return image
+    return scale_image(image, side)
 
 
 def touch_layer(
-    frame: Array, gel: tuple[Array, UntouchedGel] | None, limit: float, name: str
+    frame: Array, gel: tuple[Array, UntouchedBackground] | None, limit: float, name: str
 ) -> tuple[Array, float]:
-    """Return one of LAYERS as a picture RGB u8 (h, w, 3), and the contact score.
+    """Return one of LAYERS as an image RGB u8 (h, w, 3), and the contact score.
 
     Without a background of the same proportions it is the frame, and the score is NaN. For the
     layers MEASURED it is the frame, too.
@@ -60,14 +65,14 @@ def touch_layer(
     try:
         change = untouched.difference(frame)
     except ValueError:
-        # The background was taken before the picture was turned.
+        # The background was taken before the image was turned.
         return view, float("nan")
     if name == "difference":
         if background.shape != view.shape:
             background = cv2.resize(background, (width, height))
         (view,) = subtract_background([view], background)
     elif name == "contact":
-        mask = (cv2.resize(change, (width, height)) > limit).astype(np.uint8)
+        mask = without_islands((cv2.resize(change, (width, height)) > limit).astype(np.uint8))
         tinted = cv2.LUT(view, _TINTED)
         view = cv2.convertScaleAbs(view, alpha=1 / 3, beta=40)
         cv2.copyTo(tinted, mask, view)
@@ -84,7 +89,7 @@ def last_clip(frames: Sequence[Array], length: int) -> Array:
 
 
 def measured_layer(frame: Array, measured: Fields, name: str) -> Array:
-    """Return what was measured of a frame as a picture u8 (h, w, 3).
+    """Return what was measured of a frame as an image u8 (h, w, 3).
 
     It is "depth" drawn on the frame, or a "surface" whose grey is the depth.
     """
@@ -103,7 +108,7 @@ def field_numbers(measured: Fields) -> dict[str, Any]:
     """Return what the page writes of a frame.
 
     `scale` is the depth of the lightest colour, in the unit of the depth. `high` is the same in
-    widths of the picture.
+    widths of the image.
     """
     from anytouch_jax.fields.measure import depth_levels
 

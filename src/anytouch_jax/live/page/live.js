@@ -2,6 +2,7 @@
 // Live touch, and a classifier that is taught by touching.
 
 const KEPT_LIVE = 300, HELD = 400; // points of a live curve, ms from which a pressed button was held
+const CURVES = 100, WORDS = 300; // ms between drawings of the curves, and between changes of words, which people read
 
 const percent = (share) => `${Math.round(100 * share)} %`;
 
@@ -24,12 +25,12 @@ function verdict(result) {
 }
 
 function showLive(source, about) {
-  const canvas = el("canvas", { role: "img", ariaLabel: "live picture" }), curves = el("section", { className: "time" });
+  const canvas = el("canvas", { role: "img", ariaLabel: "live image" }), curves = el("section", { className: "time" });
   const felt = el("h2", { className: "felt" }), sure = el("div", { className: "bars small" }), why = el("p", { className: "soft" });
   const facts = el("div", { className: "facts" }), near = el("div", { className: "thumbs" }), nearest = el("div", { className: "thumbs" });
   const force = forceBar(), pictures = about.table === null ? null : framesOf(about.table, "frame", true);
   const ages = [], scores = {}, boxes = {}, view = { rotate: 0, flip: "none" };
-  let stopped = new AbortController(), shownNear = "", done = null, recording = false, pressed = 0, taught = -1, trained = false, orders = Promise.resolve();
+  let drawnAt = 0, toldAt = 0, stopped = new AbortController(), shownNear = "", done = null, recording = false, pressed = 0, taught = -1, trained = false, orders = Promise.resolve();
   let recorded = new Pictures(`${source}/recorded`, "frame", true);
   const fact = (name, value, kind = "") => {
     boxes[name] ??= facts.appendChild(el("div", { className: "fact" }, name, el("b")));
@@ -62,6 +63,8 @@ function showLive(source, about) {
   const lifted = (event) => { if (event.key === "r") release(); };
   const leave = () => { if (pressed) send({ do: "stop" }, { keepalive: true }); };
   const names = el("ul", { className: "names" }), train = el("button", { onclick: () => send({ do: "train" }) }, "Train");
+  const longer = el("button", { onclick: () => send({ do: longer.dataset.on ? "keep the best" : "train longer" }), hidden: true }, "Train longer");
+  const course = el("p", { className: "soft", role: "status" });
   const missing = el("p", { className: "soft", role: "status" }), result = el("div", { className: "column" });
   const save = (file) => guard(async () => {
     const address = URL.createObjectURL(await (await api(`${source}/taught/${file}`)).blob());
@@ -84,11 +87,21 @@ function showLive(source, about) {
     train.disabled = found.training || Boolean(found.missing);
     train.className = several.length > 1 && !found.trained ? "main" : "";
     train.textContent = found.training ? (found.trained && found.result.right === undefined ? "Measuring …" : "Training …") : found.trained ? "Train again" : "Train";
+    const more = found.longer, clock = (left) => `${Math.floor(left / 60)}:${String(Math.floor(left % 60)).padStart(2, "0")}`;
+    trained ||= more.used;
+    longer.hidden = !found.trained && !more.on;
+    longer.dataset.on = more.on ? "on" : "";
+    longer.textContent = more.on ? "Stop and keep the best" : "Train longer";
+    longer.title = "Trains the encoder too, on all recordings. Some are held out, and it never ends below the head.";
+    train.disabled ||= more.on;
+    course.className = more.fault ? "alarm" : "soft";
+    course.textContent = more.on ? `Training the encoder: ${clock(more.left)} left${more.score ? `. On held-out recordings: ${more.score}, the head alone: ${more.before}.` : ""}` : more.fault || more.said;
     missing.className = found.fault ? "alarm" : "soft";
     missing.textContent = found.fault || (several.length ? found.missing : "Type a name, hold the button, and touch. Touch it again for a second recording. Then teach another name.");
     downloads.hidden = !several.length;
     downloads.firstChild.disabled = !found.trained;
-    const use = `anytouch stream --data ${/^\d+$/.test(about.source) ? about.source : "0"} ${about.sensor ? `--sensor ${about.sensor} ` : ""}--head ${found.file} --out -`;
+    const by = more.used ? `--model ${more.folder}` : `--head ${found.file}`;
+    const use = `anytouch stream --data ${/^\d+$/.test(about.source) ? about.source : "0"} ${about.sensor ? `--sensor ${about.sensor} ` : ""}${by} --out -`;
     result.replaceChildren(...(found.trained ? [...verdict(found.result), el("p", { className: "soft small" }, "Use it in a robot:"), el("code", {}, use)] : []));
   });
 
@@ -117,7 +130,7 @@ function showLive(source, about) {
     feels.hidden = !known && one.contact === null;
     const named = known && one.contact !== false && one.label !== undefined;
     feels.classList.toggle("novel", Boolean(named && one.novel));
-    sure.hidden = !named || one.novel;
+    sure.hidden = !named || one.novel || one.p === undefined;
     nearest.hidden = !named;
     why.textContent = "";
     if (!known && one.contact === null) { felt.textContent = ""; return; }
@@ -144,7 +157,7 @@ function showLive(source, about) {
   const show = async (one, jpeg) => {
     if (one.error) { say(one.error, true); return; }
     const bitmap = await createImageBitmap(new Blob([jpeg], { type: "image/jpeg" }));
-    showLayer(canvas, bitmap, one.layer === "surface");
+    showLayer(canvas, bitmap, one.layer === "surface" ? one.fields : null);
     bitmap.close();
     const age = performance.timeOrigin + performance.now() - one.grabbed;
     ages.push(age);
@@ -153,9 +166,14 @@ function showLive(source, about) {
     main.dataset.frames = Number(main.dataset.frames ?? 0) + 1;
     if (one.taught !== taught) { taught = one.taught; learn(); }
     recording = one.recording.on;
-    if (one.frame % 10 && ages.length > 10) return; // text ten times as slow as pictures can be read
+    const now = performance.now();
+    if (now - drawnAt > CURVES) {
+      drawnAt = now;
+      draws.forEach((draw) => draw());
+    }
+    if (now - toldAt < WORDS) return;
+    toldAt = now;
     main.dataset.ages = JSON.stringify([percentile(ages, 0.5), percentile(ages, 0.99), Math.max(...ages)].map(Math.round));
-    draws.forEach((draw) => draw());
     feel(one);
     force.show(one.fields, one.layer);
     hidden.hidden = one.layer === state.layer;
@@ -169,7 +187,7 @@ function showLive(source, about) {
     fact("encoder p50, p99", `${one.encoder.map((value) => value.toFixed(1)).join(", ")} ms`);
     fact("frame to features", `${one.age.map((value) => value.toFixed(1)).join(", ")} ms`);
     fact("age on this page", `${percentile(ages, 0.5).toFixed(0)}, ${percentile(ages, 0.99).toFixed(0)} ms`, percentile(ages, 0.99) > 100 ? "bad" : "");
-    if (one.picture !== "ok" || one.missed) say(`The picture is ${one.picture}, ${one.missed} reads were missed.`, one.picture !== "ok");
+    if (one.picture !== "ok" || one.missed) say(`The image is ${one.picture}, ${one.missed} reads were missed.`, one.picture !== "ok");
     const hits = JSON.stringify([one.near, one.recorded].map((found) => found?.map((hit) => hit.row)));
     if (hits === shownNear) return;
     shownNear = hits;
@@ -182,7 +200,9 @@ function showLive(source, about) {
   const read = guard(async () => {
     stopped.abort();
     stopped = new AbortController();
-    const reader = (await api(`${source}/stream?layer=${state.layer}`, { signal: stopped.signal })).body.getReader();
+    // A picture has no more pixels than are shown: the browser decodes each of them.
+    const side = Math.round((window.devicePixelRatio || 1) * Math.max(canvas.clientWidth, canvas.clientHeight)) || 640;
+    const reader = (await api(`${source}/stream?layer=${state.layer}&side=${side}`, { signal: stopped.signal })).body.getReader();
     let data = new Uint8Array(0), newest = null, drawing = false;
     const draw = guard(async () => { // while one is decoded, others arrive: only the newest is drawn next
       drawing = true;
@@ -209,12 +229,12 @@ function showLive(source, about) {
   });
 
   const layers = layerBar(about.layers, read);
-  const hidden = el("span", { className: "soft", hidden: true }, "The untouched gel is not known yet, so the picture is shown.");
+  const hidden = el("span", { className: "soft", hidden: true }, "The untouched gel is not known yet, so the image is shown.");
   const background = el("button", { onclick: () => send({ do: "background" }) }, "Capture the untouched gel");
   const feels = el("section", { className: "card feels", hidden: true }, felt, sure, why, nearest);
   // On a phone this bar stays at the bottom, under the thumb.
   const recordBar = el("div", { className: "recordbar" }, el("label", { className: "tall" }, "name of what you touch", object), record);
-  const teach = el("section", { className: "card teach" }, el("h3", {}, "Teach it a touch"), known, recordBar, names, missing, train, result, downloads);
+  const teach = el("section", { className: "card teach" }, el("h3", {}, "Teach it a touch"), known, recordBar, names, missing, el("div", { className: "bar" }, train, longer), course, result, downloads);
   const more = el("details", {}, el("summary", {}, "Camera and latency"), el("div", { className: "column" }, el("div", { className: "bar" },
     option("rotate", [0, 90, 180, 270].map((angle) => [angle, `${angle}°`]), 0, (value) => { view.rotate = value; turn(); }),
     option("flip", [["none", "none"], ["across", "left-right"], ["down", "top-bottom"]], "none", (value) => { view.flip = value; turn(); }),

@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from anytouch_jax.errors import UserError
-from anytouch_jax.live.cameras import CameraSettings, LoopedFilm, open_source
+from anytouch_jax.live.cameras import CameraSettings, LoopedVideo, open_source
 from anytouch_jax.live.examples import EXAMPLE, ExampleCamera
 from anytouch_jax.live.page.frames import FrameReader
+from anytouch_jax.live.page.layers import SIDE
 from anytouch_jax.live.page.naming import NearestTouches, name_touch
 from anytouch_jax.live.page.packet import Shown, describe_touch, layers_of, packet
 from anytouch_jax.live.page.recorder import LiveRecorder
@@ -24,7 +25,7 @@ from anytouch_jax.live.stream import Embedded, Source, StreamSettings, stream_wi
 
 if TYPE_CHECKING:
     from anytouch_jax.encoder.encoder import Encoder
-    from anytouch_jax.encoder.linear_head import LinearHead
+    from anytouch_jax.encoder.linear_head import Head
     from anytouch_jax.live.page.feature_map import FeatureMap
 
 _KEPT = 600  # frames whose times make p50 and p99, as on the page
@@ -37,7 +38,7 @@ class Live:
     `start` begins, `stop` ends.
 
     Args:
-        source: what a user calls a camera, or a film.
+        source: what a user calls a camera, or a video.
         encoder: a loaded encoder.
         sensor: its name, None for the universal tokens.
         head: names live touch. One that is taught in the folder `out` replaces it.
@@ -55,7 +56,7 @@ class Live:
         encoder: Encoder,
         *,
         sensor: str | None,
-        head: LinearHead | None = None,
+        head: Head | None = None,
         space: FeatureMap | None = None,
         out: Path,
         camera: CameraSettings | None = None,
@@ -102,22 +103,30 @@ class Live:
             source, live = open_source(self.source, self._camera, self._log)
             if not live and Path(self.source).is_file():
                 source.release()
-                source = LoopedFilm(Path(self.source))
+                source = LoopedVideo(Path(self.source))
         self._thread = threading.Thread(target=self._run, args=(source,), daemon=True)
         self._thread.start()
 
     def stop(self) -> None:
         """End the stream, and the recording."""
         self._stopped = True
+        self.teacher.longer.stop()
         self.recorder.stop()
         if self._thread is not None:
             self._thread.join(3)
 
-    def _head_in_use(self) -> LinearHead | None:
+    def _head_in_use(self) -> Head | None:
         return self.teacher.head or self._head
 
-    async def packets(self, layer: str) -> AsyncIterator[bytes]:
-        """Yield each newest frame as a layer (see `packet`).
+    def _named(self, frame: Embedded, prepared: np.ndarray) -> dict[str, Any]:
+        """Return the name of a frame, by the encoder that was trained longer if there is one."""
+        tuned = self.teacher.longer.tuned
+        if tuned is None:
+            return name_touch(self._head_in_use(), frame.values)
+        return name_touch(tuned.head, tuned.features(prepared, self._row))
+
+    async def packets(self, layer: str, side: int = SIDE) -> AsyncIterator[bytes]:
+        """Yield each newest frame as a layer, with a long side of `side` pixels (see `packet`).
 
         Between frames it takes no thread: the server has 40, and a page that is left open keeps its
         stream.
@@ -129,7 +138,7 @@ class Live:
                 await asyncio.sleep(_LOOK)
             else:
                 seen = newest.number
-                yield await asyncio.to_thread(packet, newest, layer)
+                yield await asyncio.to_thread(packet, newest, layer, side)
 
     def _run(self, source: Any) -> None:
         """Show what a source gives, up to its end: the camera's thread."""
@@ -156,22 +165,22 @@ class Live:
         """Make the newest packet of an embedded frame."""
         kept = self.frames.last(frame.number)
         if not kept:
-            # The reader is so far ahead that the picture is gone.
+            # The reader is so far ahead that the image is gone.
             return
-        picture = kept[-1].turned
+        image = kept[-1].turned
         setup = kept[-1].setup
         score = self.frames.score(kept[-1])
         fields = None
         if score == score:  # NaN: the background is not known yet
             fields = self.frames.measured(kept, self._row)
-        self.recorder.add(picture, score, frame.values)
+        self.recorder.add(image, score, frame.values)
         self.teacher.look()
         self._times.append((frame.seconds[-1], frame.age))
         encoder, age = 1e3 * np.percentile(np.asarray(self._times), (50, 99), axis=0).T
         about: dict[str, Any] = {
             "frame": frame.number,
             "grabbed": 1e3 * (frame.started + frame.at),
-            "picture": frame.picture,
+            "picture": frame.image,
             "gel": "captured" if setup.running is None else "estimated",
             "encoder": encoder.round(2).tolist(),
             "age": age.round(2).tolist(),
@@ -180,7 +189,7 @@ class Live:
             "taught": self.teacher.version,
         }
         about |= describe_touch(score, self.frames.threshold, fields)
-        about |= name_touch(self._head_in_use(), frame.values)
+        about |= self._named(frame, kept[-1].prepared)
         spaces = {"near": self._space, "recorded": self.teacher.space}
         about |= self._nearest(frame.values, spaces)
-        self._newest = Shown(self._newest.number + 1, about, picture, setup.small, fields)
+        self._newest = Shown(self._newest.number + 1, about, image, setup.small, fields)

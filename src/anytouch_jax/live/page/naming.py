@@ -5,17 +5,20 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from anytouch_jax.encoder.arrays import Array, unit_rows
 from anytouch_jax.encoder.calibration import support
+from anytouch_jax.encoder.number_head import NumberHead
 
 if TYPE_CHECKING:
-    from anytouch_jax.encoder.linear_head import LinearHead
+    from anytouch_jax.encoder.linear_head import Head
     from anytouch_jax.live.page.feature_map import FeatureMap
 
 _SEARCH = 0.5  # seconds between searches for the nearest touches
 
 
-def name_touch(head: LinearHead | None, values: Array) -> dict[str, Any]:
+def name_touch(head: Head | None, values: Array) -> dict[str, Any]:
     """Return the name of features (E,), and whether to believe it.
 
     `p` is never more than the recordings of the head support. Without a `limit` there are too few
@@ -23,6 +26,8 @@ def name_touch(head: LinearHead | None, values: Array) -> dict[str, Any]:
     """
     if head is None:
         return {}
+    if isinstance(head, NumberHead):
+        return _number(head, values)
     if head.calibration is None:
         (label,), p = head(values[None])
         return {"label": str(label), "p": round(float(p.max()), 3)}
@@ -39,6 +44,16 @@ def name_touch(head: LinearHead | None, values: Array) -> dict[str, Any]:
         # JSON has no infinity: of few recordings nothing is novel.
         "limit": round(limit, 3) if limit < 1e9 else None,
     }
+
+
+def _number(head: NumberHead, values: Array) -> dict[str, Any]:
+    """Return the number of features (E,) as a name, with half of its interval."""
+    one = head.assess(values[None])
+    half = float(one.high[0] - one.value[0])
+    name = f"{head.label} {one.value[0]:.3g}"
+    if np.isfinite(half):
+        name += f" ± {half:.2g}"
+    return {"label": name, "novel": bool(one.novel[0])}
 
 
 class NearestTouches:

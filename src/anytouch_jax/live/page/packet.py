@@ -10,14 +10,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import cv2
 
-from anytouch_jax.data.background.estimate import UntouchedGel
+from anytouch_jax.data.background.estimate import UntouchedBackground
 from anytouch_jax.data.images import encode
 from anytouch_jax.encoder.arrays import Array
 from anytouch_jax.live.page.layers import (
     LAYERS,
     MEASURED,
+    SIDE,
     field_numbers,
     measured_layer,
+    scale_down,
     touch_layer,
 )
 
@@ -33,15 +35,15 @@ class Shown(NamedTuple):
     Attributes:
         number: of the packet, from 1. 0 is nothing yet.
         about: what is known of the frame.
-        picture: RGB u8 (h, w, 3), turned.
+        image: RGB u8 (h, w, 3), turned.
         gel: the background, scaled down, and ready to be compared.
         fields: what was measured.
     """
 
     number: int = 0
     about: Mapping[str, Any] = {}
-    picture: Array | None = None
-    gel: tuple[Array, UntouchedGel] | None = None
+    image: Array | None = None
+    gel: tuple[Array, UntouchedBackground] | None = None
     fields: Fields | None = None
 
 
@@ -74,18 +76,22 @@ def describe_touch(score: float, threshold: float, fields: Fields | None) -> dic
     }
 
 
-def packet(shown: Shown, layer: str) -> bytes:
-    """Return a frame for the page: length u32, JSON, length u32, JPEG, little endian."""
+def packet(shown: Shown, layer: str, side: int = SIDE) -> bytes:
+    """Return a frame for the page: length u32, JSON, length u32, JPEG, little endian.
+
+    The long side of the picture has at most `side` pixels: as many as the page shows, because the
+    browser has to decode each of them.
+    """
     about = {"layer": layer, "sent": 1e3 * time.time(), **shown.about}
     jpeg = b""
-    if shown.picture is not None:
+    if shown.image is not None:
         # The score of a frame is known already: without a background none is computed again.
         gel = shown.gel if layer != LAYERS[0] else None
-        view, score = touch_layer(shown.picture, gel, about["threshold"], layer)
+        view, score = touch_layer(shown.image, gel, about["threshold"], layer)
         if score != score or (layer in MEASURED and shown.fields is None):
             about["layer"] = LAYERS[0]
         elif layer in MEASURED and shown.fields is not None:
             view = measured_layer(view, shown.fields, layer)
-        jpeg = encode(view, ".jpg", cv2.IMWRITE_JPEG_QUALITY, _QUALITY)
+        jpeg = encode(scale_down(view, side), ".jpg", cv2.IMWRITE_JPEG_QUALITY, _QUALITY)
     text = json.dumps(about).encode()
     return struct.pack("<I", len(text)) + text + struct.pack("<I", len(jpeg)) + jpeg

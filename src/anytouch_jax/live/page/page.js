@@ -6,7 +6,7 @@ const COLOURS = ["#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377
   "#4b7d2c", "#888888"];
 const RATE = 10, AHEAD = 6, KEPT = 900; // frames a second of recordings, frames read ahead, pictures in memory
 const DASHES = [[], [7, 3], [2, 3], [9, 3, 2, 3]]; // lines differ by more than their colour
-const LAYERS = { frame: "Picture", difference: "Difference", contact: "Contact", depth: "Depth", surface: "Surface" };
+const LAYERS = { frame: "Image", difference: "Difference", contact: "Contact", depth: "Depth", surface: "Surface" };
 const main = document.getElementById("main"), tabs = document.getElementById("tabs");
 const state = { sources: [], stop: () => {}, keys: {}, layer: "frame", token: new URLSearchParams(location.hash.slice(1)).get("token") };
 
@@ -260,8 +260,8 @@ function clipCard(source, clip, pictures, title) {
     el("div", { className: "bar" }, clip.sensor ? el("h3", {}, clip.sensor) : null, contact), words);
   if (clip.photo) {
     guard(async () => {
-      const image = await picture(`${source}/photo/${clip.rows[0]}`, "photograph of the object");
-      node.append(el("figure", { className: "photo" }, image, el("figcaption", {}, "photograph")));
+      const image = await picture(`${source}/photo/${clip.rows[0]}`, "RGB image of the object");
+      node.append(el("figure", { className: "photo" }, image, el("figcaption", {}, "RGB image")));
     })();
   }
   const load = async (t) => {
@@ -274,7 +274,7 @@ function clipCard(source, clip, pictures, title) {
   const show = async (t) => {
     for (let next = t + 1; next <= Math.min(t + AHEAD, clip.rows.length - 1); next++) pictures.get(clip.rows[next]);
     const one = await load(t), score = one.score ?? null;
-    if (one.bitmap) showLayer(canvas, one.bitmap, one.isSurface);
+    if (one.bitmap) showLayer(canvas, one.bitmap, one.isSurface ? one.fields : null);
     force.show(one.fields, one.isSurface ? "surface" : state.layer);
     contact.textContent = one.error ?? (score === null ? (clip.rows.length > 1 ? "\u00a0" : "") : score > clip.threshold ? "● contact" : "○ no contact");
   };
@@ -493,8 +493,8 @@ function showStart(source, about) {
       el("section", { className: "card" }, el("h3", {}, "No sensor at hand"),
         el("p", {}, "Two things press a gel in turn. Watch depth and force, and teach their names as you would with a camera."), example)),
     el("section", { className: "card" }, el("h3", {}, "Something else"), el("ul", { className: "steps" },
-      step("A film in the place of a camera", "anytouch view press.mp4 --live --sensor digit"),
-      step("Recordings: a manifest, a folder or a film", "anytouch view recordings"),
+      step("A video in place of a camera", "anytouch view press.mp4 --live --sensor digit"),
+      step("Recordings: a manifest, a folder or a video", "anytouch view recordings"),
       step("Features and their map", "anytouch view manifest.parquet features.npz")))),
     el("h3", {}, "Two presses, each by three sensors"), thumbs);
   guard(async () => {

@@ -23,13 +23,13 @@ from anytouch_jax.live.page.shared import SharedManifest
 
 SCORE = "label.contact_score"
 _QUICK = (cv2.IMWRITE_PNG_COMPRESSION, 1)
-_WAITING = 64  # pictures that wait for the disk: more are dropped and counted
+_WAITING = 64  # images that wait for the disk: more are dropped and counted
 
 
 class _Recorded(NamedTuple):
     """A frame RGB u8 (h, w, 3), its contact score, NaN if unknown, and its features f32 (E,)."""
 
-    picture: Array
+    image: Array
     score: float
     values: Array
 
@@ -89,17 +89,17 @@ class LiveRecorder:
         self._thread.start()
         self._queue = waiting
 
-    def add(self, picture: Array, score: float, values: Array) -> None:
+    def add(self, image: Array, score: float, values: Array) -> None:
         """Store a frame if a recording is on.
 
         Args:
-            picture: RGB u8 (h, w, 3).
+            image: RGB u8 (h, w, 3).
             score: its contact score, NaN if unknown.
             values: its features f32 (E,).
         """
         waiting = self._queue
         if waiting is not None and waiting.qsize() < _WAITING:
-            waiting.put(_Recorded(picture, score, values))
+            waiting.put(_Recorded(image, score, values))
         elif waiting is not None:
             self._lost += 1
 
@@ -147,7 +147,7 @@ class LiveRecorder:
             if gel is not None:
                 (part / "background.png").write_bytes(encode(gel, ".png", *_QUICK))
             while (frame := waiting.get()) is not None:
-                data = encode(frame.picture, ".png", *_QUICK)
+                data = encode(frame.image, ".png", *_QUICK)
                 (part / f"{self._written:06d}.png").write_bytes(data)
                 is_unknown = frame.score != frame.score
                 scores.append(None if is_unknown else round(frame.score, 3))

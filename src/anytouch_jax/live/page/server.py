@@ -1,4 +1,4 @@
-"""The server of the page: an ASGI application with JSON, pictures and the live stream.
+"""The server of the page: an ASGI application with JSON, images and the live stream.
 
 No address names a file. Other web sites cannot read or change anything. The name of the host is
 checked, there are no CORS headers, and every change needs a header that another site cannot send.
@@ -39,7 +39,7 @@ from anytouch_jax.live.examples import EXAMPLE
 from anytouch_jax.live.page.feature_map import FeatureMap
 from anytouch_jax.live.page.layers import LAYERS, SIDE, field_numbers, scale_down
 from anytouch_jax.live.page.runs import Run
-from anytouch_jax.live.page.tables import Table, open_examples, open_film, open_folder, title
+from anytouch_jax.live.page.tables import Table, open_examples, open_folder, open_video_table, title
 
 # Its libraries take seconds to import, and a manifest needs none of them.
 if TYPE_CHECKING:
@@ -48,8 +48,14 @@ if TYPE_CHECKING:
 LOCAL = ("127.0.0.1", "localhost", "::1")
 # of every request that changes something: another site would need CORS to send it
 HEADER = "x-anytouch"
+SMALLEST = 64  # pixels of the long side of a live picture
 _SCRIPTS = ("page.js", "fields.js", "space.js", "live.js")
-_ASSETS = {"": "text/html", "page.css": "text/css"} | dict.fromkeys(_SCRIPTS, "text/javascript")
+_SHARED = "theme.css"  # with reports, so it lies in the package's root
+_ASSETS = (
+    {"": "text/html"}
+    | dict.fromkeys((_SHARED, "page.css"), "text/css")
+    | dict.fromkeys(_SCRIPTS, "text/javascript")
+)
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' "
     "blob: data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -85,9 +91,9 @@ class StartPage:
 
 
 def open_sources(paths: Sequence[Path]) -> list[Source]:
-    """Return what the page shows of each path: a manifest, a folder, a film, features or a run.
+    """Return what the page shows of each path: a manifest, a folder, a video, features or a run.
 
-    Features show the pictures of a table among the paths, or of the manifest in their folder that
+    Features show the images of a table among the paths, or of the manifest in their folder that
     they were made from. Raises UserError for anything else.
     """
     tables = list[Table]()
@@ -98,7 +104,7 @@ def open_sources(paths: Sequence[Path]) -> list[Source]:
             tables.append(open_examples())
         elif not path.exists():
             raise UserError(
-                f"There is no {path}. Name a manifest, a folder, a film, features, a run or a "
+                f"There is no {path}. Name a manifest, a folder, a video, features, a run or a "
                 "camera."
             )
         elif path.suffix.lower() == ".npz":
@@ -124,7 +130,7 @@ def _open_table(path: Path) -> Table:
     if path.suffix.lower() in _TABLES:
         return Table(manifests.read(path), title(path))
     if not path.is_dir():
-        return open_film(path)
+        return open_video_table(path)
     inside = [
         file
         for file in sorted(path.iterdir())
@@ -225,7 +231,8 @@ def _asset(request: Request) -> Response:
     name = request.path_params.get("name", "")
     if name not in _ASSETS:
         return Response("not found", 404, _SAFE)
-    data = (files("anytouch_jax.live.page") / (name or "page.html")).read_bytes()
+    folder = files("anytouch_jax" if name == _SHARED else "anytouch_jax.live.page")
+    data = (folder / (name or "page.html")).read_bytes()
     headers = _SAFE | {"Cache-Control": "no-cache"}
     return Response(data, media_type=_ASSETS[name], headers=headers)
 
@@ -258,11 +265,11 @@ def _frame(request: Request, table: Table) -> Response:
     headers = {"X-Score": "" if np.isnan(score) else f"{score:.2f}"}
     if fields is not None:
         headers["X-Fields"] = json.dumps(field_numbers(fields))
-    return _picture(view, headers)
+    return _image(view, headers)
 
 
 def _photo(request: Request, table: Table) -> Response:
-    return _picture(table.photo(request.path_params["row"]))
+    return _image(table.photo(request.path_params["row"]))
 
 
 def _map(request: Request, space: FeatureMap) -> Response:
@@ -283,11 +290,14 @@ def _losses(request: Request, run: Run) -> Response:
 
 
 def _figure(request: Request, run: Run) -> Response:
-    return _picture(run.figure(request.path_params["name"]), side=4000)
+    return _image(run.figure(request.path_params["name"]), side=4000)
 
 
 def _stream(request: Request, live: Live) -> Response:
-    packets = live.packets(_layer(request))
+    side = SIDE
+    if "side" in request.query_params:
+        side = max(SMALLEST, min(SIDE, _number(request, "side")))
+    packets = live.packets(_layer(request), side)
     return StreamingResponse(packets, media_type="application/octet-stream", headers=_SAFE)
 
 
@@ -427,7 +437,7 @@ def _control(live: Live, order: Any) -> None:
     flip = order.get("flip")
     if action == "orient" and rotate in (0, 90, 180, 270) and flip in ("none", "across", "down"):
         if live.recorder.state()["on"]:
-            raise UserError("A recording is on. Stop it before you turn the picture.")
+            raise UserError("A recording is on. Stop it before you turn the image.")
         live.frames.orient(rotate, flip)
     elif action == "background":
         live.frames.capture_background()
@@ -440,6 +450,10 @@ def _control(live: Live, order: Any) -> None:
         live.teacher.reload()
     elif action == "train":
         live.teacher.train()
+    elif action == "train longer":
+        live.teacher.train_longer()
+    elif action == "keep the best":
+        live.teacher.longer.stop()
     elif action == "leave out" and isinstance(sequence, str):
         live.teacher.leave_out(sequence)
     else:
@@ -471,7 +485,7 @@ def _json(value: Any, status: int = 200) -> Response:
     return JSONResponse(value, status, _SAFE | {"Cache-Control": "no-store"})
 
 
-def _picture(picture: Any, headers: dict[str, str] | None = None, *, side: int = SIDE) -> Response:
+def _image(image: Any, headers: dict[str, str] | None = None, *, side: int = SIDE) -> Response:
     headers = _SAFE | {"Cache-Control": "private, max-age=60"} | (headers or {})
-    data = encode(scale_down(picture, side), ".jpg", cv2.IMWRITE_JPEG_QUALITY, 90)
+    data = encode(scale_down(image, side), ".jpg", cv2.IMWRITE_JPEG_QUALITY, 90)
     return Response(data, media_type="image/jpeg", headers=headers)

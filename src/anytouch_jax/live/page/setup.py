@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from anytouch_jax.data.background.estimate import UntouchedGel
-from anytouch_jax.data.background.rule import RunningGel
+from anytouch_jax.data.background.estimate import UntouchedBackground
+from anytouch_jax.data.background.rule import RunningBackground
 from anytouch_jax.data.transforms import Flip, orient_frame
 from anytouch_jax.encoder.arrays import Array
 from anytouch_jax.encoder.base import Preprocess
@@ -24,7 +24,7 @@ class Setup(NamedTuple):
     Attributes:
         rotate: degrees clockwise.
         flip: after the rotation.
-        running: the estimate of the background, None if a picture of it was given.
+        running: the estimate of the background, None if an image of it was given.
         gel: the background RGB u8 (h, w, 3), turned as frames are.
         small: the background, scaled down, and ready to be compared.
         preprocess: makes the encoder's input of a turned frame.
@@ -33,18 +33,18 @@ class Setup(NamedTuple):
 
     rotate: int
     flip: Flip
-    running: RunningGel | None
+    running: RunningBackground | None
     gel: Array | None
-    small: tuple[Array, UntouchedGel] | None
+    small: tuple[Array, UntouchedBackground] | None
     preprocess: Preprocess
     measure: Measure | None
 
-    def turned(self, picture: Array) -> Array:
-        """Return a picture as read, turned."""
-        return np.ascontiguousarray(orient_frame(picture, self.rotate, self.flip))
+    def turned(self, image: Array) -> Array:
+        """Return an image as read, turned."""
+        return np.ascontiguousarray(orient_frame(image, self.rotate, self.flip))
 
     def is_turned_as(self, other: Setup) -> bool:
-        """Return whether pictures of both are turned in one way."""
+        """Return whether images of both are turned in one way."""
         return (self.rotate, self.flip) == (other.rotate, other.flip)
 
 
@@ -54,7 +54,7 @@ def make_setup(
     rotate: int,
     flip: Flip,
     gel: Array | None,
-    running: RunningGel | None = None,
+    running: RunningBackground | None = None,
 ) -> Setup:
     """Return a setup with a background.
 
@@ -67,10 +67,10 @@ def make_setup(
         running: the estimate that `gel` comes from, if it was not given by hand.
     """
     if gel is None and running is None:
-        running = RunningGel()
+        running = RunningBackground()
     small = None
     if gel is not None:
-        small = scale_down(gel), UntouchedGel(gel)
+        small = scale_down(gel), UntouchedBackground(gel)
     measure = None
     if encoder.measures:
         measure = encoder.measure_of(sensor, gel, log=lambda _: None)
@@ -79,19 +79,19 @@ def make_setup(
 
 
 def measure_last(
-    encoder: Encoder, measure: Measure, row: int, picture: Array, prepared: list[Array]
+    encoder: Encoder, measure: Measure, row: int, image: Array, prepared: list[Array]
 ) -> Fields:
-    """Return the fields of a picture.
+    """Return the fields of an image.
 
     Args:
         encoder: the one that `measure` is of.
         measure: turns its raw fields into mm and N.
         row: of its table of sensors.
-        picture: RGB u8 (h, w, 3), turned.
+        image: RGB u8 (h, w, 3), turned.
         prepared: the encoder's input of some frames u8 (H, W, 3), of which it is the last.
     """
     clip = last_clip(prepared, encoder.config.model.frames)
     rows = np.array([row], np.int32)
-    aspect = np.log([picture.shape[0] / picture.shape[1]]).astype(np.float32)
+    aspect = np.log([image.shape[0] / image.shape[1]]).astype(np.float32)
     raw = encoder.encode_and_measure(clip[None], rows, aspect)[1]
-    return measure(raw, [picture])
+    return measure(raw, [image])

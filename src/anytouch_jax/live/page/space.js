@@ -67,7 +67,7 @@ function showSpace(source, about) {
       }, 2000 / RATE);
       parts.push(el("div", { className: "stage" }, canvas), el("button", { onclick: open(found.row) }, "Show this touch"));
     } else {
-      parts.push(el("p", { className: "soft" }, "Name the manifest too, and you see the pictures."));
+      parts.push(el("p", { className: "soft" }, "Name the manifest too, and you see the images."));
     }
     const cards = found.hits.map((hit) => hitCard(hit, pictures, pictures ? open(hit) : () => choose(points.rows.indexOf(hit.row))));
     side.replaceChildren(el("h3", {}, found.row.about.object || `Row ${found.row.row}`), list, ...parts,

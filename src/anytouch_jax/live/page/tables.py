@@ -1,6 +1,6 @@
-"""Recordings on the page: touches of a manifest, a folder of pictures, or a film.
+"""Recordings on the page: touches of a manifest, a folder of images, or a video.
 
-A touch is the recordings (sequences) that share a value of `touch`, or one without. Pictures are
+A touch is the recordings (sequences) that share a value of `touch`, or one without. Images are
 read when shown, and libraries that take seconds are imported when they are needed.
 """
 
@@ -20,8 +20,8 @@ import pyarrow.compute as pc
 from anytouch_jax import encoder
 from anytouch_jax.config import UNIVERSAL
 from anytouch_jax.data.background.contact import DEFAULT_THRESHOLD, THRESHOLDS
-from anytouch_jax.data.background.estimate import UntouchedGel
-from anytouch_jax.data.background.rule import FRAMES, UnitGels, recording_gel
+from anytouch_jax.data.background.estimate import UntouchedBackground
+from anytouch_jax.data.background.rule import FRAMES, Backgrounds, recording_gel
 from anytouch_jax.data.images import QUIET, count_frames, decode, list_images, open_video, to_rgb
 from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder.arrays import Array
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from anytouch_jax.encoder.encoder import Encoder
     from anytouch_jax.encoder.measured import Fields
 
-# the sensor and the split of a folder or a film, which the page leaves out
+# the sensor and the split of a folder or a video, which the page leaves out
 UNKNOWN = "unknown"
 UNUSED = "unused"
 # PRESS-SENSOR.jpg, and PRESS-SENSOR-background.jpg
@@ -56,14 +56,14 @@ _ONE_BY_ONE = threading.Lock()  # the encoder is opened and compiled by one requ
 
 
 class Table:
-    """Touches of a manifest. `film` is a video whose frames are the rows."""
+    """Touches of a manifest. `video` is a video whose frames are the rows."""
 
     kind = "table"
 
-    def __init__(self, manifest: Manifest, name: str, film: Path | None = None) -> None:
+    def __init__(self, manifest: Manifest, name: str, video: Path | None = None) -> None:
         self.manifest = manifest
         self.name = name
-        self._film = None if film is None else _Film(film)
+        self._video = None if video is None else _Video(video)
         self._chosen = lru_cache(8)(self._choose)
         self._measured = lru_cache(256)(self._measure)
 
@@ -124,14 +124,14 @@ class Table:
         return int(np.searchsorted(self._touches(()), self._touch_of[at]))
 
     def frame(self, row: int) -> Array:
-        """Return the picture of a row, RGB u8 (h, w, 3). Raises UserError."""
+        """Return the image of a row, RGB u8 (h, w, 3). Raises UserError."""
         self._check(row)
-        if self._film is not None:
-            return self._film.read(int(self.manifest.value(row, "frame_index")))
+        if self._video is not None:
+            return self._video.read(int(self.manifest.value(row, "frame_index")))
         return decode(self.manifest.file(row))
 
     def photo(self, row: int) -> Array:
-        """Return the photograph of a row, RGB u8 (h, w, 3). Raises UserError if there is none."""
+        """Return the RGB image of a row, RGB u8 (h, w, 3). Raises UserError if there is none."""
         self._check(row)
         return decode(self.manifest.file(row, "image_path"))
 
@@ -168,21 +168,21 @@ class Table:
         return THRESHOLDS.get(self.manifest.value(row, "sensor"), DEFAULT_THRESHOLD)
 
     @cached_property
-    def _untouched(self) -> Callable[[int], tuple[Array, UntouchedGel] | None]:
+    def _untouched(self) -> Callable[[int], tuple[Array, UntouchedBackground] | None]:
         """A function from a row to its background, scaled down and to compare.
 
         It returns None if the background is unknown.
         """
 
-        def made(picture: Array) -> tuple[Array, UntouchedGel]:
-            return scale_down(picture), UntouchedGel(picture)
+        def made(image: Array) -> tuple[Array, UntouchedBackground]:
+            return scale_down(image), UntouchedBackground(image)
 
-        if self._film is None:
-            return UnitGels(self.manifest).shared(made, 32)
+        if self._video is None:
+            return Backgrounds(self.manifest).shared(made, 32)
         count = len(self.manifest)
         chosen = range(0, count, -(-count // FRAMES))
-        of_film = made(recording_gel(map(self._film.read, chosen))[0])
-        return lambda _: of_film
+        of_video = made(recording_gel(map(self._video.read, chosen))[0])
+        return lambda _: of_video
 
     def _check_filters(self, filters: dict[str, str]) -> None:
         """Raise UserError for a filter that the table does not have."""
@@ -305,7 +305,7 @@ def _one_of(values: list[Any]) -> Any:
     return values[0] if values else None
 
 
-class _Film:
+class _Video:
     """Frames of a video by number. The next frame is read without a search."""
 
     def __init__(self, path: Path) -> None:
@@ -327,7 +327,7 @@ class _Film:
 
 
 def open_folder(folder: Path) -> Table:
-    """Return the pictures of a folder as one recording. Raises UserError if there are none."""
+    """Return the images of a folder as one recording. Raises UserError if there are none."""
     frames, named = list_images(folder)
     return Table(
         _one_recording(folder, [file.name for file in frames], named.get("background")),
@@ -335,14 +335,14 @@ def open_folder(folder: Path) -> Table:
     )
 
 
-def open_film(film: Path) -> Table:
-    """Return the frames of a film as one recording. Raises UserError if it has none."""
-    count = count_frames(film)
+def open_video_table(video: Path) -> Table:
+    """Return the frames of a video as one recording. Raises UserError if it has none."""
+    count = count_frames(video)
     if not count:
         raise UserError(
-            f"{film} is no film that can be read. Name a manifest, a folder of pictures or a film."
+            f"{video} is no video that can be read. Name a manifest, a folder of images or a video."
         )
-    return Table(_one_recording(film.parent, [film.name] * count, None), film.stem, film)
+    return Table(_one_recording(video.parent, [video.name] * count, None), video.stem, video)
 
 
 def open_examples() -> Table:

@@ -20,14 +20,14 @@ from anytouch_jax.errors import UserError
 from anytouch_jax.live.page.accuracy import RESULT, measure_head
 from anytouch_jax.live.page.feature_map import FeatureMap
 from anytouch_jax.live.page.fitting import fit_head
+from anytouch_jax.live.page.longer import LongerTraining
 from anytouch_jax.live.page.recorder import SCORE, LiveRecorder
-from anytouch_jax.live.page.shared import Stamp
 from anytouch_jax.live.page.tables import Table
 
 if TYPE_CHECKING:
     from anytouch_jax.data.manifest.manifest import Manifest
     from anytouch_jax.encoder.encoder import Encoder
-    from anytouch_jax.encoder.linear_head import LinearHead
+    from anytouch_jax.encoder.linear_head import Head
 
 _LOOK = 1.0  # seconds between looks for the recordings of other pages
 _BATCH = 4  # frames embedded at once: live touch waits for them
@@ -52,21 +52,26 @@ class Teacher:
         self._log = log
         self.head_file = recorder.out / "head.npz"
         self._features = recorder.out / "features.npz"
-        self.head: LinearHead | None = None
+        self.head: Head | None = None
         self.space: FeatureMap | None = None
         self.table: Table | None = None
         self.version = 0  # rises with every recording and every head, also of other pages
-        self._stamp: Stamp = None  # of the manifest that `table` was read from
-        self._noticed: Stamp = None  # of a manifest that was not read yet
+        self._stamp: tuple[int, int, int] | None = (
+            None  # of the manifest that `table` was read from
+        )
+        self._noticed: tuple[int, int, int] | None = None  # of a manifest that was not read yet
         self._looked = 0.0
+        self._was_longer = False
         self._training = threading.Lock()
         self._fault = ""
+        self.longer = LongerTraining(encoder, recorder, log)
         self.reload()
         if self.head_file.is_file() and self._features.is_file():
             try:
                 self._use(load_head(self.head_file))
             except UserError as error:
                 log(f"The head in {recorder.out} is not used. {error}")
+        self.longer.reopen(self.head_file)
 
     def reload(self) -> None:
         """Read the manifest again, after a recording. Raises UserError."""
@@ -85,6 +90,10 @@ class Teacher:
         now = time.monotonic()
         if now - self._looked > _LOOK:
             self._looked = now
+            if self.longer.is_on or self._was_longer:
+                # The page shows the time left, and then the result.
+                self.version += 1
+            self._was_longer = self.longer.is_on
             stamp = self._recorder.manifest.stamp()
             if stamp not in (self._stamp, self._noticed):
                 self._noticed = stamp
@@ -105,6 +114,7 @@ class Teacher:
             "fault": self._fault,
             "trained": self.head is not None,
             "file": str(self._recorder.named / self.head_file.name),
+            "longer": self.longer.about(),
             "result": {name: float(result[name]) for name in RESULT if name in result},
         }
 
@@ -135,7 +145,19 @@ class Teacher:
             raise UserError(missing)
         if not self._training.acquire(blocking=False):
             raise UserError("A head is being trained already.")
+        self.longer.forget()
         threading.Thread(target=self._train, daemon=True).start()
+
+    def train_longer(self) -> None:
+        """Fine-tune the encoder on all recordings, in a thread.
+
+        Raises UserError without two names, and while something is trained.
+        """
+        if missing := self.about()["missing"]:
+            raise UserError(missing)
+        if self._training.locked():
+            raise UserError("A head is being trained already.")
+        self.longer.start()
 
     def leave_out(self, sequence: str) -> None:
         """Mark a recording as unused. Its frames stay. Raises UserError."""
@@ -143,7 +165,7 @@ class Teacher:
         self.reload()
 
     def archive(self) -> IO[bytes]:
-        """Return a ZIP of the manifest and its pictures, and of the head with its features."""
+        """Return a ZIP of the manifest and its images, and of the head with its features."""
         out = self._recorder.out
         files = {self._recorder.file, self.head_file, self._features}
         if self.table is not None:
@@ -223,13 +245,13 @@ class Teacher:
             )
             if len(found) < len(unknown):
                 raise UserError(
-                    f"{len(unknown) - len(found)} recorded frames have no picture of the untouched "
+                    f"{len(unknown) - len(found)} recorded frames have no image of the untouched "
                     "gel."
                 )
             known |= {paths[place]: one for place, one in zip(unknown, values, strict=True)}
         return np.stack([known[path] for path in paths])
 
-    def _use(self, head: LinearHead) -> None:
+    def _use(self, head: Head) -> None:
         """Let live touch be named by a head that lies in the folder.
 
         Raises UserError for one of another encoder.

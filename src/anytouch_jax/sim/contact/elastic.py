@@ -23,6 +23,9 @@ import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 from jax import Array
+from jax.typing import DTypeLike
+
+from anytouch_jax.sim.draws import Scalar
 
 Host = npt.NDArray[np.float64]
 
@@ -146,7 +149,7 @@ def _kernel_table(size: int, padded: int, parity: int, weighted: bool) -> Host:
     return table
 
 
-def _waves(padded: int, dtype: Any) -> Array:
+def _waves(padded: int, dtype: DTypeLike) -> Array:
     return jnp.asarray(_wave_table(padded), dtype)
 
 
@@ -302,7 +305,9 @@ def sideways_table(poisson: float) -> tuple[Host, float]:
     return bessel0 @ (weights * smooth), rest
 
 
-def sideways_kernel(plan: Plan, pitch: Any, poisson: float, thickness: Any, dtype: Any) -> Any:
+def sideways_kernel(
+    plan: Plan, pitch: Scalar, poisson: float, thickness: Scalar, dtype: DTypeLike
+) -> Any:
     """Return the potential of the sideways motion of a layer's surface by a load on a pixel.
 
     Its gradient is that motion. It is (H, W) at offsets >= 0, in units of P / (pi E*). A load pulls
@@ -317,7 +322,7 @@ def sideways_kernel(plan: Plan, pitch: Any, poisson: float, thickness: Any, dtyp
     return xp.where(far < FAR, _between(far, table) + rest * xp.arcsinh(2 / far), 0)
 
 
-def _library(dtype: Any, *values: Any) -> tuple[ModuleType, Any]:
+def _library(dtype: DTypeLike, *values: Any) -> tuple[ModuleType, Any]:
     """Return the array library that computes with some values, and the type of its numbers.
 
     Values that are known before a program runs are for numpy, in float64. XLA would compute with
@@ -347,7 +352,7 @@ def _looked_up(far: Any, table: Host, limit: float) -> Any:
 
 
 def normal_spectrum(
-    plan: Plan, pitch: Any, poisson: float, thickness: Any, share: Any, dtype: Any
+    plan: Plan, pitch: Scalar, poisson: float, thickness: Scalar, fraction: Scalar, dtype: DTypeLike
 ) -> Array:
     """Return the spectrum (KH, KW) of the normal coefficients.
 
@@ -356,22 +361,22 @@ def normal_spectrum(
         pitch: mm between pixels.
         poisson: Poisson's ratio of the gel.
         thickness: mm of the gel; infinite for a half-space.
-        share: E* over the gel's plane modulus: the part of the motion that is the layer's.
+        fraction: E* over the gel's plane modulus: the part of the motion that is the layer's.
         dtype: Of the spectrum.
     """
     if is_infinite(thickness):
         return jnp.asarray(_normal_host(plan), dtype)
-    xp, kind = _library(dtype, pitch, thickness, share)
+    xp, kind = _library(dtype, pitch, thickness, fraction)
     deep = xp.asarray(_normal_host(plan), kind)
     scale = xp.asarray(pitch / thickness, kind)
     table, _, _ = layer_tables(poisson)
     radius = xp.asarray(_radius(plan), kind) * scale
-    layer = deep - plan.spectrum(share * scale / np.pi * _looked_up(radius, table, 1.0))
+    layer = deep - plan.spectrum(fraction * scale / np.pi * _looked_up(radius, table, 1.0))
     return jnp.asarray(layer, dtype)
 
 
 def tangential_spectra(
-    plan: Plan, pitch: Any, poisson: float, thickness: Any, share: Any, dtype: Any
+    plan: Plan, pitch: Scalar, poisson: float, thickness: Scalar, fraction: Scalar, dtype: DTypeLike
 ) -> Array:
     """Return the spectra (3, KH, KW) of the tangential coefficients xx, xy, yy.
 
@@ -379,14 +384,14 @@ def tangential_spectra(
     """
     if is_infinite(thickness):
         return jnp.asarray(_tangential_host(plan, poisson), dtype)
-    xp, kind = _library(dtype, pitch, thickness, share)
+    xp, kind = _library(dtype, pitch, thickness, fraction)
     deep = xp.asarray(_tangential_host(plan, poisson), kind)
     scale = xp.asarray(pitch / thickness, kind)
     _, mean, twofold = layer_tables(poisson)
     radius = xp.asarray(_radius(plan), kind) * scale
     ratio = poisson / (1 - poisson)
-    mean_at = share * scale / np.pi * _looked_up(radius, mean, 1 + ratio / 2)
-    twofold_at = share * scale / np.pi * _looked_up(radius, twofold, ratio / 2)
+    mean_at = fraction * scale / np.pi * _looked_up(radius, mean, 1 + ratio / 2)
+    twofold_at = fraction * scale / np.pi * _looked_up(radius, twofold, ratio / 2)
     cosine, sine = (xp.asarray(table, kind) for table in _twice_the_angle(plan))
     # A motion along x by a load along x varies as cos 2 phi about its mean over directions.
     parts = (mean_at + cosine * twofold_at, sine * twofold_at, mean_at - cosine * twofold_at)

@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import DTypeLike
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.sim.contact.elastic import Plan, is_infinite, normal_spectrum, sideways_kernel
@@ -32,6 +33,7 @@ from anytouch_jax.sim.contact.solver import (
     ratio,
     scaled,
 )
+from anytouch_jax.sim.draws import Scalar
 
 Fidelity = Literal["exact", "fast"]
 
@@ -46,12 +48,12 @@ class Gel:
     An infinite thickness is a half-space. `modulus` and `thickness` may be traced arrays.
     """
 
-    modulus: Any = 150.0
+    modulus: Scalar = 150.0
     poisson: float = 0.48
-    thickness: Any = float("inf")
+    thickness: Scalar = float("inf")
 
     @property
-    def plane(self) -> Any:
+    def plane(self) -> Scalar:
         """The plane strain modulus E / (1 - nu^2) in kPa."""
         return self.modulus / (1 - self.poisson**2)
 
@@ -74,12 +76,12 @@ class PressResult(NamedTuple):
 
 def press(
     surface: Array,
-    depth: Any,
+    depth: Scalar,
     gel: Gel,
-    pitch: Any,
+    pitch: Scalar,
     *,
     fidelity: Fidelity = "exact",
-    modulus_object: Any = float("inf"),
+    modulus_object: Scalar = float("inf"),
     tolerance: float = 1e-4,
     iterations: int | None = None,
 ) -> PressResult:
@@ -116,7 +118,7 @@ def press(
     plane = jnp.asarray(gel.plane, dtype)
     # The composite modulus E*, of 1 / E* = 1 / E_gel + 1 / E_object, over the gel's own. It is the
     # part of the approach by which the gel gives way, and not the object.
-    share = 1 / (1 + plane / jnp.asarray(modulus_object, dtype))
+    fraction = 1 / (1 + plane / jnp.asarray(modulus_object, dtype))
     cut = jnp.where(jnp.isfinite(surface), surface + depth, -jnp.ones((), dtype))
     scale = jnp.max(cut)
     scale = jnp.where((scale > 0) & (depth >= 0), scale, 0)
@@ -124,7 +126,7 @@ def press(
     cut = jnp.where(scale > 0, cut / jnp.where(scale > 0, scale, 1), -1)
     plans = grids(surface.shape) if fidelity == "fast" else [Plan(*surface.shape)]
     known = known_numbers(gel, pitch_given, modulus_object)
-    step, part = (pitch, share) if known is None else known
+    step, part = (pitch, fraction) if known is None else known
     compliances = [
         _compliance(plan, step * 2**level, gel, part, dtype) for level, plan in enumerate(plans)
     ]
@@ -134,8 +136,8 @@ def press(
         most = 300 if iterations is None else iterations
         solution, load, moved = _exact(compliances, cut, tolerance, most)
     # both move: the gel's part is the rest
-    moved = moved - _of_object(plans[0], load, share, modulus_object)
-    pressure = solution.x * (scale * plane * share / pitch)
+    moved = moved - _of_object(plans[0], load, fraction, modulus_object)
+    pressure = solution.x * (scale * plane * fraction / pitch)
     force = jnp.sum(pressure) * pitch**2 * KPA_MM2
     converged = solution.residual <= tolerance
     return PressResult(
@@ -143,7 +145,7 @@ def press(
     )
 
 
-def _check(surface: Any, depth: Any, pitch: Any, fidelity: str) -> None:
+def _check(surface: Any, depth: Scalar, pitch: Scalar, fidelity: str) -> None:
     if fidelity not in ("exact", "fast"):
         raise UserError(f'fidelity is "exact" or "fast", not {fidelity!r}')
     if np.ndim(surface) != 2:
@@ -168,7 +170,7 @@ def _check(surface: Any, depth: Any, pitch: Any, fidelity: str) -> None:
 
 
 def _check_elastic(
-    shape: tuple[int, ...], gel: Gel, pitch: Any, fidelity: str, modulus_object: Any
+    shape: tuple[int, ...], gel: Gel, pitch: Scalar, fidelity: str, modulus_object: Scalar
 ) -> None:
     if not 0 <= gel.poisson <= 0.5:
         raise UserError(f"a gel's Poisson ratio is 0 to 0.5, not {gel.poisson}")
@@ -190,8 +192,8 @@ def _check_elastic(
             )
 
 
-def known_numbers(gel: Gel, pitch: Any, modulus_object: Any) -> tuple[float, float] | None:
-    """Return pitch and share of a spectrum (`elastic.normal_spectrum`), if no number is traced.
+def known_numbers(gel: Gel, pitch: Scalar, modulus_object: Scalar) -> tuple[float, float] | None:
+    """Return pitch and fraction of a spectrum (`elastic.normal_spectrum`), if no number is traced.
 
     With them the spectra of a constant gel are computed by numpy, and not by XLA as it compiles.
     """
@@ -212,14 +214,14 @@ def grids(shape: tuple[int, ...]) -> list[Plan]:
 
 
 def _compliance(
-    plan: Plan, pitch: float | Array, gel: Gel, share: float | Array, dtype: Any
+    plan: Plan, pitch: float | Array, gel: Gel, fraction: float | Array, dtype: DTypeLike
 ) -> Compliance:
     """Return the normal displacement by a pressure (H, W), as a function."""
-    spectrum = normal_spectrum(plan, pitch, gel.poisson, gel.thickness, share, dtype)
+    spectrum = normal_spectrum(plan, pitch, gel.poisson, gel.thickness, fraction, dtype)
     return lambda pressure: plan.inverse(plan.even(plan.forward(pressure), spectrum))
 
 
-def _of_object(plan: Plan, pressure: Array, share: Array, modulus_object: Any) -> Any:
+def _of_object(plan: Plan, pressure: Array, fraction: Array, modulus_object: Scalar) -> Any:
     """Return the object's part of the displacement by a pressure, in units of `cut`.
 
     The object is a half-space.
@@ -227,7 +229,7 @@ def _of_object(plan: Plan, pressure: Array, share: Array, modulus_object: Any) -
     if is_infinite(modulus_object):
         return 0.0
     deep = normal_spectrum(plan, 1.0, 0.0, float("inf"), 1.0, pressure.dtype)
-    return (1 - share) * plan.inverse(plan.even(plan.forward(pressure), deep))
+    return (1 - fraction) * plan.inverse(plan.even(plan.forward(pressure), deep))
 
 
 def _exact(
@@ -293,7 +295,7 @@ def _descended(apply: Compliance, cut: Array, pressure: Array, iterations: int) 
 
 
 def sideways(
-    pressure: Array, gel: Gel, pitch: Any, *, fidelity: Fidelity = "exact", coarse: bool = False
+    pressure: Array, gel: Gel, pitch: Scalar, *, fidelity: Fidelity = "exact", coarse: bool = False
 ) -> Array:
     """Return the tangential motion of a bonded layer's surface by a pressure alone.
 
@@ -357,19 +359,19 @@ def doubled(field: Array) -> Array:
     return jax.image.resize(field, (2 * field.shape[0], 2 * field.shape[1]), "linear")
 
 
-def positions(shape: tuple[int, int], pitch: Any) -> tuple[Array, Array]:
+def positions(shape: tuple[int, int], pitch: Scalar) -> tuple[Array, Array]:
     """Return x (right) and y (down) of the pixels of a grid, mm from its centre, each (H, W)."""
     pitch = jnp.asarray(pitch)
     y, x = (pitch * (jnp.arange(n, dtype=pitch.dtype) - (n - 1) / 2) for n in shape)
     return jnp.broadcast_to(x[None, :], shape), jnp.broadcast_to(y[:, None], shape)
 
 
-def area(pressure: Array, pitch: Any) -> Array:
+def area(pressure: Array, pitch: Scalar) -> Array:
     """Return the contact's area in mm^2."""
     return jnp.sum(pressure > 0, (-2, -1)) * jnp.asarray(pitch, pressure.dtype) ** 2
 
 
-def centroid(pressure: Array, pitch: Any) -> Array:
+def centroid(pressure: Array, pitch: Scalar) -> Array:
     """Return the centre (x, y) of a pressure (H, W), mm from the field's centre.
 
     It is (0, 0) without contact.

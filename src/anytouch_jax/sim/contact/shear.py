@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import ArrayLike, DTypeLike
 
 from anytouch_jax.errors import UserError
 from anytouch_jax.sim.contact.elastic import Plan, is_infinite, tangential_spectra
@@ -33,6 +34,7 @@ from anytouch_jax.sim.contact.mechanics import (
     positions,
 )
 from anytouch_jax.sim.contact.solver import Compliance, descent, ratio
+from anytouch_jax.sim.draws import Scalar
 
 SLIPPING = 0.999  # of the friction limit
 
@@ -51,7 +53,7 @@ class Shear(NamedTuple):
     residual: Array  # error of the surface's motion over the object's motion in this step
 
 
-def at_rest(shape: tuple[int, int], dtype: Any = jnp.float32) -> Shear:
+def at_rest(shape: tuple[int, int], dtype: DTypeLike = jnp.float32) -> Shear:
     """Return the state before any tangential motion, on a grid of `shape`."""
     field = jnp.zeros((*shape, 2), dtype)
     zero = jnp.zeros((), dtype)
@@ -66,14 +68,14 @@ class Interface(NamedTuple):
     """A gel and an object, and how their tangential contact is solved: equal in all frames."""
 
     gel: Gel
-    pitch: Any  # mm between pixels
-    friction: Any  # Coulomb's coefficient
+    pitch: Scalar  # mm between pixels
+    friction: Scalar  # Coulomb's coefficient
     # With "exact", projected gradients with all tangential coefficients on the grid of the pressure
     # reach `tolerance` in at most `iterations` (400). With "fast", an elastic predictor and the
     # return to the friction cone are followed by `iterations` (6) corrections on a coarser grid.
     fidelity: Fidelity = "exact"
-    modulus_object: Any = float("inf")  # E / (1 - nu^2) of the object, kPa
-    centre: Any = (0.0, 0.0)  # (2,) mm, about which the object turns
+    modulus_object: Scalar = float("inf")  # E / (1 - nu^2) of the object, kPa
+    centre: ArrayLike | tuple[float, float] = (0.0, 0.0)  # (2,) mm, about which the object turns
     coarse: bool = False  # leave `squeezed` and the displacement on the coarser grid of "fast"
     tolerance: float = 1e-3
     iterations: int | None = None
@@ -82,10 +84,10 @@ class Interface(NamedTuple):
 def shear_step(
     state: Shear | None,
     contact: PressResult,
-    motion: Any,
+    motion: ArrayLike,
     gel: Gel,
-    pitch: Any,
-    friction: Any,
+    pitch: Scalar,
+    friction: Scalar,
     *,
     squeezed: Array | None = None,
     **options: Any,
@@ -97,7 +99,7 @@ def shear_step(
 def slide(
     state: Shear | None,
     contact: PressResult,
-    motion: Any,
+    motion: ArrayLike,
     interface: Interface,
     squeezed: Array | None = None,
 ) -> Shear:
@@ -126,15 +128,17 @@ def slide(
     pitch = jnp.asarray(interface.pitch, dtype)
     friction = jnp.asarray(interface.friction, dtype)
     # E* over the gel's plane modulus, as in `mechanics.press`
-    share = 1 / (1 + jnp.asarray(gel.plane, dtype) / jnp.asarray(interface.modulus_object, dtype))
+    gel_part = 1 / (
+        1 + jnp.asarray(gel.plane, dtype) / jnp.asarray(interface.modulus_object, dtype)
+    )
     # kPa of traction per mm. Tractions are divided by it, so everything below is in mm.
-    unit = jnp.asarray(gel.plane, dtype) * share / pitch
+    unit = jnp.asarray(gel.plane, dtype) * gel_part / pitch
     plan = grids(pressure.shape)[-1] if fidelity == "fast" else Plan(*pressure.shape)
     times = pressure.shape[0] // plan.rows
     load = _pooled(pressure, times)
     before = _pooled(state.traction, times) / unit * times
     known = known_numbers(gel, interface.pitch, interface.modulus_object)
-    step, part = (pitch, share) if known is None else known
+    step, part = (pitch, gel_part) if known is None else known
     spectra = tangential_spectra(plan, step * times, gel.poisson, gel.thickness, part, dtype)
     apply = _compliance(plan, spectra)
     limit = jnp.where(load > 0, friction * load, 0) / unit * times
@@ -167,7 +171,7 @@ def slide(
     # The compliance is that of gel and object together. The object's part is a half-space's.
     if not is_infinite(interface.modulus_object):
         deep = tangential_spectra(plan, pitch * times, gel.poisson, float("inf"), 1.0, dtype)
-        displacement = displacement - (1 - share) * _compliance(plan, deep)(total)
+        displacement = displacement - (1 - gel_part) * _compliance(plan, deep)(total)
     if not interface.coarse:
         displacement = enlarged(displacement, pressure.shape)
     # A traction is smooth relative to the pressure, which falls to zero at the rim. So the ratio is
@@ -191,7 +195,7 @@ def slide(
     )
 
 
-def _check(contact: PressResult, pitch: Any, friction: Any, fidelity: str) -> None:
+def _check(contact: PressResult, pitch: Scalar, friction: Scalar, fidelity: str) -> None:
     if fidelity not in ("exact", "fast"):
         raise UserError(f'fidelity is "exact" or "fast", not {fidelity!r}')
     if jnp.ndim(contact.pressure) != 2:
@@ -267,7 +271,7 @@ def _totals(
 ) -> tuple[Array, Array, Array]:
     """Return force, torque about the centre of pressure, and the slipping part of the contact.
 
-    They are (2,) N, N mm, and a share of the contact's area.
+    They are (2,) N, N mm, and a fraction of the contact's area.
     """
     x, y = positions((pressure.shape[0], pressure.shape[1]), pitch)
     middle = centroid(pressure, pitch)

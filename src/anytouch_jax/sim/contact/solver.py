@@ -143,9 +143,9 @@ def descent(
         # Along `way` the energy is a parabola. Its lowest point is at most the whole way off.
         bent_by = apply(way)
         bent = jnp.sum(way * bent_by)
-        share = jnp.clip(ratio(-jnp.sum(s.excess * way), bent, 0.0), 0, 1)
-        x = s.x + share * way
-        excess = s.excess + share * bent_by
+        fraction = jnp.clip(ratio(-jnp.sum(s.excess * way), bent, 0.0), 0, 1)
+        x = s.x + fraction * way
+        excess = s.excess + fraction * bent_by
         step = ratio(jnp.sum(way * way), bent, 1 / OWN)
         change = s.residual if tolerance is None else residual(x, excess)
         return _Descent(x, excess, step, change, s.iterations + 1)

@@ -1,1 +1,1 @@
-"""Your own sensor: its look, fitted to a few pictures, and tokens from simulated touches."""
+"""Your own sensor: its look, fitted to a few images, and tokens from simulated touches."""

@@ -77,7 +77,7 @@ class Grid(NamedTuple):
 
 
 def grid_of(shape: tuple[int, int], width_mm: float) -> Grid:
-    """Return the places of square pixels (H, W) of a picture that shows `width_mm`."""
+    """Return the places of square pixels (H, W) of an image that shows `width_mm`."""
     height, width = shape
     pixel = width_mm / width
     x, y = np.meshgrid(
@@ -127,7 +127,8 @@ def _profiles(ball_mm: float) -> dict[_Key, _Profiles]:
 
     found = dict[_Key, _Profiles]()
     for thickness in THICKNESSES:
-        gel = Gel(150.0, thickness=np.float32(thickness))
+        # An array, so that one compiled program serves all thicknesses.
+        gel = Gel(150.0, thickness=np.asarray(thickness, np.float32))
         dents = np.asarray(solve(DEPTHS.astype(np.float32), gel))
         _, slope = lines(dents, SKIN)
         for halo in HALOS:
@@ -146,10 +147,12 @@ def _features(grid: Grid, profiles: _Profiles, pose: Array) -> tuple[Array, ...]
     away = np.hypot(dx, dy)
     k = float(np.clip(np.interp(pose[2], DEPTHS, np.arange(len(DEPTHS))), 0, len(DEPTHS) - 1.001))
     low = int(k)
-    share = k - low
+    fraction = k - low
     # Between two depths, and between two distances, the profiles are interpolated linearly.
     slope, soft, wide = (
-        np.interp(away, profiles.away, (1 - share) * table[low] + share * table[low + 1], right=0.0)
+        np.interp(
+            away, profiles.away, (1 - fraction) * table[low] + fraction * table[low + 1], right=0.0
+        )
         for table in profiles[1:4]
     )
     cos, sin = (along / np.maximum(away, 1e-6) for along in (dx, dy))
@@ -195,7 +198,7 @@ def _ridge(gram: Array, target: Array, penalties: Array) -> Array:
     return np.asarray(np.linalg.solve(scaled, target / scale[:, None]) / scale[:, None])
 
 
-# What few presses do not show is small: high powers, drift over the picture, and a halo that copies
+# What few presses do not show is small: high powers, drift over the image, and a halo that copies
 # the slopes.
 _PENALTY = np.concatenate(
     [
@@ -375,7 +378,7 @@ def fit_presses(change: Array, clear: Array) -> Colour:
     slopes = white @ _least_curl(white, clear).T
     if _depth_of(slopes)[touched].mean() < 0:
         slopes = -slopes
-    # The colours drift over the picture: those of the nearest surface, and the slopes by these
+    # The colours drift over the image: those of the nearest surface, and the slopes by these
     # colours, in turn.
     place = np.stack([np.ones_like(grid.u), grid.u, grid.v], -1)
     for _ in range(4):

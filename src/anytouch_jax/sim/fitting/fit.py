@@ -1,7 +1,7 @@
-"""Fit of your own sensor: from a few pictures to a folder NAME.sensor for the simulator.
+"""Fit of your own sensor: from a few images to a folder NAME.sensor for the simulator.
 
-`see` finds what the pictures show by themselves: the untouched gel, presses, dots and noise.
-`fit_sensor` adds the colours by slope (`colour`), and writes the folder. Lengths of pictures are in
+`see` finds what the images show by themselves: the untouched gel, presses, dots and noise.
+`fit_sensor` adds the colours by slope (`colour`), and writes the folder. Lengths of images are in
 pixels.
 """
 
@@ -18,10 +18,10 @@ from anytouch_jax.config import FIELD_SENSORS, OWN_SENSOR, SENSORS, check_spelli
 from anytouch_jax.data.background.dots import Dots, find_dots, hidden
 from anytouch_jax.data.background.estimate import (
     DIFFERENT,
-    UntouchedGel,
+    UntouchedBackground,
     change_of_light,
-    median_gel,
-    scale_picture,
+    median_background,
+    scale_image,
 )
 from anytouch_jax.data.background.rule import FEWEST, TINT, median, reduced
 from anytouch_jax.errors import UserError
@@ -34,15 +34,15 @@ from anytouch_jax.sim.sensing.own import MM, OwnSensor
 Array = np.ndarray
 WORK = 96  # pixels of the long side on which the colour change is fitted
 BASE = 40  # pixels of the long side of a stored untouched gel
-ANOTHER = 0.15  # share of the pictures that shows another unit
-DARK = 14  # grey levels: the corners of a round picture
+ANOTHER = 0.15  # fraction of the images that shows another unit
+DARK = 14  # grey levels: the corners of a round image
 # A filter that removes surfaces and keeps the deviation of white noise: its squares sum to one.
 _CURVED = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32) / 6
 NOT_FLAT = tuple(name for name, record in RECORDS.items() if not record.is_flat)
 
 
 class Seen(NamedTuple):
-    """What N pictures of one unit show, P of them presses."""
+    """What N images of one unit show, P of them presses."""
 
     frames: Array  # u8 (N, h, w, 3)
     gel: Array  # u8 (h, w, 3), untouched
@@ -51,45 +51,43 @@ class Seen(NamedTuple):
     clear: Array  # bool (P, H, W), where no dots hide it, and no colour is at its limit
     dots: Dots | None
     noise: float
-    noise_spread: float  # relative, from picture to picture
+    noise_spread: float  # relative, from image to image
     source: str  # of the untouched gel, in words
 
 
-def see(pictures: Sequence[Array], background: Array | None = None) -> Seen:
-    """Return what pictures RGB u8 (h, w, 3) of one unit show.
+def see(images: Sequence[Array], background: Array | None = None) -> Seen:
+    """Return what images RGB u8 (h, w, 3) of one unit show.
 
-    Raises UserError for pictures that cannot be fitted.
+    Raises UserError for images that cannot be fitted.
     """
-    frames = [reduced(picture) for picture in pictures]
+    frames = [reduced(image) for image in images]
     if len(frames) < FEWEST:
         raise UserError(
-            f"{len(frames)} pictures are too few to fit a sensor; take {FEWEST} or more, 20 are "
-            "good"
+            f"{len(frames)} images are too few to fit a sensor; take {FEWEST} or more, 20 are good"
         )
     shapes = {frame.shape for frame in frames}
     if len(shapes) > 1:
         raise UserError(
-            f"the pictures have {len(shapes)} sizes; give those of one camera and one setting"
+            f"the images have {len(shapes)} sizes; give those of one camera and one setting"
         )
     _check_one_unit(frames)
     if background is None:
         gel = median(frames)
-        source = f"median of {len(frames)} pictures"
+        source = f"median of {len(frames)} images"
     else:
         gel = _given(background, frames[0])
         source = "given"
     _check_flat(gel)
-    untouched = UntouchedGel(gel)
+    untouched = UntouchedBackground(gel)
     pressed = np.array([untouched.score(frame) >= DIFFERENT for frame in frames])
     if not pressed.any():
         raise UserError(
-            "no picture shows a press; press objects of all kinds into the gel, at changing places"
+            "no image shows a press; press objects of all kinds into the gel, at changing places"
         )
     # A median of presses at one place would hold the press.
-    if background is None and median_gel([scale_picture(frame) for frame in frames]) is None:
+    if background is None and median_background([scale_image(frame) for frame in frames]) is None:
         raise UserError(
-            "every picture shows a press at the same place; name the untouched gel with "
-            "--background"
+            "every image shows a press at the same place; name the untouched gel with --background"
         )
     dots = find_dots(gel)
     noise, spread = _noise(np.stack(frames), gel, dots)
@@ -106,32 +104,32 @@ def _given(background: Array, frame: Array) -> Array:
     height, width = frame.shape[:2]
     if abs(gel.shape[1] / gel.shape[0] / (width / height) - 1) > 0.02:
         raise UserError(
-            "the background has other proportions than the pictures; take it with the same camera"
+            "the background has other proportions than the images; take it with the same camera"
         )
     return cv2.resize(gel, (width, height), interpolation=cv2.INTER_AREA)
 
 
 def _check_one_unit(frames: Sequence[Array]) -> None:
-    """Raise UserError if the pictures are of two units.
+    """Raise UserError if the images are of two units.
 
-    Then a part of them differs from the rest in most places, and its pictures not from each other.
+    Then a part of them differs from the rest in most places, and its images not from each other.
     """
     thumbs = [cv2.resize(one, (32, 24), interpolation=cv2.INTER_AREA) for one in frames]
     small = np.stack(thumbs).astype(np.float32)
-    # A press changes a part of a picture, so the median over the places is that of the gels.
+    # A press changes a part of an image, so the median over the places is that of the gels.
     apart = np.array([np.median(np.abs(small - one), axis=(1, 2)).max(1) for one in small])
     near = apart <= TINT
     rest = np.flatnonzero(~near[np.argmax(near.sum(1))])
     enough = len(rest) >= max(2, ANOTHER * len(frames))
     if enough and near[np.ix_(rest, rest)].sum(1).max() >= max(2, 0.5 * len(rest)):
         raise UserError(
-            f"{len(rest)} of {len(frames)} pictures differ from the others in most places, as if "
+            f"{len(rest)} of {len(frames)} images differ from the others in most places, as if "
             "taken with another unit or in other light; fit each unit by itself"
         )
 
 
 def _check_flat(gel: Array) -> None:
-    """Raise UserError for a round picture: four black corners around a bright middle."""
+    """Raise UserError for a round image: four black corners around a bright middle."""
     height, width = (side // 10 for side in gel.shape[:2])
     corners = [
         gel[rows, columns]
@@ -142,13 +140,13 @@ def _check_flat(gel: Array) -> None:
     middle = gel[3 * height : -3 * height].mean()
     if brightest < DARK < middle / 3:
         raise UserError(
-            "the picture is round, so the sensor is not flat; a flat gel that fills the picture "
+            "the image is round, so the sensor is not flat; a flat gel that fills the image "
             "can be fitted"
         )
 
 
 class Fitted(NamedTuple):
-    """A fitted sensor: its folder, its numbers, what the pictures show, and the colour change."""
+    """A fitted sensor: its folder, its numbers, what the images show, and the colour change."""
 
     folder: Path
     numbers: OwnSensor
@@ -164,7 +162,7 @@ def check_name(name: str) -> None:
             f"{name} measures a field and has no camera; a sensor with a camera can be fitted"
         )
     if word in NOT_FLAT:
-        raise UserError(f"{name} is not flat; a flat gel that fills the picture can be fitted")
+        raise UserError(f"{name} is not flat; a flat gel that fills the image can be fitted")
     if word in SENSORS:
         raise UserError(
             f"{name} is a sensor of the table; give yours another name, such as my_{word}"
@@ -175,7 +173,7 @@ def check_name(name: str) -> None:
 
 
 def fit_sensor(
-    pictures: Sequence[np.ndarray],
+    images: Sequence[np.ndarray],
     name: str,
     width_mm: float,
     out: str | Path,
@@ -183,34 +181,34 @@ def fit_sensor(
     background: np.ndarray | None = None,
     ball_mm: float | None = None,
 ) -> Fitted:
-    """Fit a sensor to pictures of one unit, and write its folder.
+    """Fit a sensor to images of one unit, and write its folder.
 
     Args:
-        pictures: RGB u8 (h, w, 3).
+        images: RGB u8 (h, w, 3).
         name: Of the sensor.
-        width_mm: Width of the gel that a picture shows.
+        width_mm: Width of the gel that an image shows.
         out: The folder, NAME.sensor.
-        background: The untouched gel; without it, the median of the pictures.
+        background: The untouched gel; without it, the median of the images.
         ball_mm: Diameter of the ball, if all presses are of one. Its slopes are known, so the
             strength of the colours and the thickness of the gel are found too.
 
     Raises:
-        UserError: For pictures that cannot be fitted.
+        UserError: For images that cannot be fitted.
     """
     check_name(name)
     if Path(out).suffix != OWN_SENSOR:
         raise UserError(f"{out} must end in {OWN_SENSOR}; choose another --out")
-    height, width = pictures[0].shape[:2]
+    height, width = images[0].shape[:2]
     height_mm = width_mm * height / width
     if not all(MM.low <= side <= MM.high for side in (width_mm, height_mm)):
         raise UserError(
-            f"a picture of {width} x {height} pixels that is {width_mm:g} mm wide shows "
+            f"an image of {width} x {height} pixels that is {width_mm:g} mm wide shows "
             f"{width_mm:g} x {height_mm:.3g} mm; the sides of a gel are {MM.words}. Check "
             "--width-mm."
         )
     if ball_mm is not None and not 1 <= ball_mm <= 40:
         raise UserError(f"a ball of {ball_mm:g} mm cannot be used; take one of 3 to 12 mm")
-    seen = see(pictures, background)
+    seen = see(images, background)
     if ball_mm is None:
         found = colour.fit_presses(seen.change, seen.clear)
     else:
@@ -238,7 +236,7 @@ def _markers(dots: Dots, pixel: float) -> Markers:
         pitch=round(dots.pitch * pixel, 4),
         radius=round(dots.radius * pixel, 4),
         aspect=round(dots.aspect, 3),
-        share=1.0,
+        fraction=1.0,
         ink=(red, green, blue),
         bend=round(dots.bend, 4),
     )
@@ -251,21 +249,21 @@ def _sure(seen: Seen, found: Colour, *, with_ball: bool) -> dict[str, str]:
     else:
         dots = f"steps from dot to dot {seen.dots.spread:.1%} around the lattice"
     return {
-        "pictures": f"{len(seen.frames)}, of which {int(seen.pressed.sum())} show a press",
+        "images": f"{len(seen.frames)}, of which {int(seen.pressed.sum())} show a press",
         "untouched gel": f"{seen.source}; its lights and vignette are in it",
         "dots": dots,
-        "noise": f"{seen.noise_spread:.0%} from picture to picture",
+        "noise": f"{seen.noise_spread:.0%} from image to image",
         "colour": f"explains {found.explained:.0%} of the change, from {found.source}",
         "size": "as given",
         "thickness_mm, halo_mm": "the best of a few" if with_ball else "not seen",
-        "modulus_kpa, skin_mm": "not seen in pictures: usual values, edit what you know",
+        "modulus_kpa, skin_mm": "not seen in images: usual values, edit what you know",
     }
 
 
 def _noise(frames: Array, gel: Array, dots: Dots | None) -> tuple[float, float]:
     """Return the standard deviation of a pixel where nothing presses, and its relative spread.
 
-    Both are from picture to picture.
+    Both are from image to image.
     """
     fine = []
     calm = []
@@ -276,7 +274,7 @@ def _noise(frames: Array, gel: Array, dots: Dots | None) -> tuple[float, float]:
         fine.append(cv2.filter2D(frame.astype(np.float32), -1, _CURVED))
     weight = np.stack(calm)[..., None].astype(np.float32)
     count = weight.sum(0)
-    # The fixed pattern of camera and gel is no noise. It is the mean over the calm pictures, which
+    # The fixed pattern of camera and gel is no noise. It is the mean over the calm images, which
     # takes a part of the noise with it: hence the factor of an unbiased variance.
     mean = (np.stack(fine) * weight).sum(0) / np.maximum(count, 1)
     left = (np.stack(fine) - mean) * np.sqrt(count / np.maximum(count - 1, 1))
@@ -308,19 +306,19 @@ def _changes(frames: Sequence[Array], gel: Array, dots: Dots | None) -> tuple[Ar
         if dots is not None:
             weight[hidden(frame, dots)] = 0
         # Averages over the pixels that no dot hides.
-        share = cv2.resize(weight, size, interpolation=cv2.INTER_AREA)
+        fraction = cv2.resize(weight, size, interpolation=cv2.INTER_AREA)
         change = frame.astype(np.float32) - gel
         change -= change_of_light(change)
         small = cv2.resize(change * weight[..., None], size, interpolation=cv2.INTER_AREA)
-        own = small / np.maximum(share, 1e-3)[..., None]
+        own = small / np.maximum(fraction, 1e-3)[..., None]
         if dots is not None:  # what the dots hide is as around them
-            near = cv2.GaussianBlur(share, (0, 0), 2)
+            near = cv2.GaussianBlur(fraction, (0, 0), 2)
             around = cv2.GaussianBlur(small, (0, 0), 2) / np.maximum(near, 1e-3)[..., None]
-            own = np.where(share[..., None] > 0.3, own, around)
+            own = np.where(fraction[..., None] > 0.3, own, around)
         changes.append(own / 255)
         limited = weight * ((frame.min(2) < 3) | (frame.max(2) > 252))
         clear.append(
-            (share > 0.3) & (cv2.resize(limited, size, interpolation=cv2.INTER_AREA) < 0.1)
+            (fraction > 0.3) & (cv2.resize(limited, size, interpolation=cv2.INTER_AREA) < 0.1)
         )
     return np.stack(changes), np.stack(clear)
 
@@ -330,4 +328,4 @@ def without_dots(seen: Seen) -> Array:
     gel: Any = seen.gel
     if seen.dots is not None:
         gel = cv2.inpaint(gel, seen.dots.mask.astype(np.uint8), 3, cv2.INPAINT_TELEA)
-    return scale_picture(cv2.GaussianBlur(gel, (0, 0), 1.5), BASE)
+    return scale_image(cv2.GaussianBlur(gel, (0, 0), 1.5), BASE)

@@ -1,4 +1,4 @@
-"""Simulated touches of your own sensor and of known ones: for its picture, and for its tokens."""
+"""Simulated touches of your own sensor and of known ones: for its image, and for its tokens."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ OBJECTS = 160  # of a world
 COUNT = 24  # touches of a batch, each by a known sensor and by yours
 SIZE = 112  # pixels of a side
 FOLDS = 5
-COLUMNS = 6  # of the picture
-TILE = 150  # pixels of a picture's height in it
+COLUMNS = 6  # of the image
+TILE = 150  # pixels of an image's height in it
 
 sample = jax.jit(endless.sample_touches, static_argnames=("sampling", "count"))
 
@@ -65,18 +65,18 @@ def compare(
     ball_mm: float | None = None,
     seed: int = 0,
 ) -> float:
-    """Write a picture of real frames above simulated ones, and measure how different they are.
+    """Write an image of real frames above simulated ones, and measure how different they are.
 
     Args:
         frames: Real frames u8 (N, h, w, 3) of presses.
         gel: Their background u8 (h, w, 3).
         sensor: The folder NAME.sensor.
-        out: The picture to write.
+        out: The image to write.
         ball_mm: Diameter of the ball, if all presses are of one.
         seed: Of the simulated touches and of the classifier's folds.
 
     Returns:
-        The fraction of held-out pictures that a linear classifier names rightly as real or
+        The fraction of held-out images that a linear classifier names rightly as real or
         simulated: 0.5 is chance.
     """
     world = own_world(sensor, "train", ball_mm=ball_mm)
@@ -88,20 +88,20 @@ def compare(
     ]
     made = np.concatenate([part.clip[:, 1, -1] for part in parts])[: len(real)]
     behind = np.concatenate([part.background[:, 1] for part in parts])[: len(real)]
-    atomic_write(out, encode(_picture(real, made)))
-    # Changes are compared, and not pictures: the backgrounds of units differ more than their dents.
+    atomic_write(out, encode(_image(real, made)))
+    # Changes are compared, and not images: the backgrounds of units differ more than their dents.
     real_changes = [_small(frame) - _small(gel) for frame in real]
     made_changes = [a.astype(np.float32) - b for a, b in zip(made, behind, strict=True)]
     return separable(real_changes, made_changes, seed)
 
 
-def _small(picture: Array) -> Array:
-    """Return a picture f32 in the size of the simulated ones."""
-    return cv2.resize(picture, (SIZE, SIZE), interpolation=cv2.INTER_AREA).astype(np.float32)
+def _small(image: Array) -> Array:
+    """Return an image f32 in the size of the simulated ones."""
+    return cv2.resize(image, (SIZE, SIZE), interpolation=cv2.INTER_AREA).astype(np.float32)
 
 
-def _picture(real: Array, made: Array) -> Array:
-    """Return two rows of real pictures above two rows of simulated ones, u8."""
+def _image(real: Array, made: Array) -> Array:
+    """Return two rows of real images above two rows of simulated ones, u8."""
     wide = round(TILE * real.shape[2] / real.shape[1])
     rows = []
     for group in (real, made):
@@ -128,7 +128,7 @@ def separable(real: list[Array], made: list[Array], seed: int = 0) -> float:
         scale = rows[train].std(0) + 1e-6
         x = (rows[train] - middle) / scale
         y = kind[train]
-        # There are about as many pictures as statistics, so the penalty is a strong one.
+        # There are about as many images as statistics, so the penalty is a strong one.
         weights = np.linalg.solve(x.T @ x + 10.0 * np.eye(x.shape[1]), x.T @ (y - y.mean()))
         guess = ((rows[test] - middle) / scale) @ weights + y.mean()
         right.append(np.sign(guess) == kind[test])
@@ -142,7 +142,7 @@ def _statistics(change: Array) -> Array:
         one = cv2.GaussianBlur(change, (0, 0), blur) if blur else change
         parts.append(np.log(1e-2 + np.abs(np.diff(one, axis=0)).mean((0, 1))))
         parts.append(np.log(1e-2 + np.abs(np.diff(one, axis=1)).mean((0, 1))))
-    # Correlations of the colours. The unit on the diagonal keeps those of a flat picture finite.
+    # Correlations of the colours. The unit on the diagonal keeps those of a flat image finite.
     colours = np.cov(change.reshape(-1, 3).T) + np.eye(3)
     deviation = np.sqrt(np.outer(np.diag(colours), np.diag(colours)))
     parts.append((colours / deviation)[np.triu_indices(3, 1)])

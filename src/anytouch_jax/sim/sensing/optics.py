@@ -38,7 +38,7 @@ Array = jax.Array
 Matrices = tuple[Array, Array, Array, Array]  # rows: value, slope; columns: value, slope
 
 
-class PictureView(NamedTuple):
+class PixelPositions(NamedTuple):
     """Places of an image's columns and rows."""
 
     x: Array  # (W,) mm from the field's middle
@@ -47,19 +47,19 @@ class PictureView(NamedTuple):
     v: Array  # (H,)
 
 
-class Picture(NamedTuple):
+class Rendering(NamedTuple):
     """How a unit is shown. It is equal in all frames of a clip."""
 
     sensor: Sensor
     unit: Unit
     resolution: tuple[int, int]  # (height, width) in pixels
     photometry: Photometry | None = None  # instead of that of the sensor
-    stretched: bool = False  # as in `picture_view`
+    stretched: bool = False  # as in `pixel_positions`
 
     @property
-    def view(self) -> PictureView:
+    def view(self) -> PixelPositions:
         """The places of its columns and rows."""
-        return picture_view(self.sensor, self.unit, self.resolution, stretched=self.stretched)
+        return pixel_positions(self.sensor, self.unit, self.resolution, stretched=self.stretched)
 
 
 class Skin(NamedTuple):
@@ -89,7 +89,7 @@ class _Channel(NamedTuple):
     uneven: Leaf  # (5,)
 
 
-def picture_size(sensor: Sensor, short: int = 224) -> tuple[int, int]:
+def image_size(sensor: Sensor, short: int = 224) -> tuple[int, int]:
     """Return (height, width) of an image of the whole field with square pixels.
 
     Its short side has `short` pixels. 0 is the sensor's resolution.
@@ -100,9 +100,9 @@ def picture_size(sensor: Sensor, short: int = 224) -> tuple[int, int]:
     return round(sensor.field[0] * scale), round(sensor.field[1] * scale)
 
 
-def picture_view(
+def pixel_positions(
     sensor: Sensor, unit: Unit, resolution: tuple[int, int], *, stretched: bool = False
-) -> PictureView:
+) -> PixelPositions:
     """Return the part of the field in an image of (height, width), zoomed and mirrored.
 
     It is the largest part of the image's shape. If `stretched`, the whole field fills the image,
@@ -116,7 +116,9 @@ def picture_view(
     x = unit.window[0] + unit.mirror[0] * unit.zoom * wide * (jnp.arange(width) + 0.5 - width / 2)
     y = unit.window[1] + unit.mirror[1] * unit.zoom * tall * (jnp.arange(height) + 0.5 - height / 2)
     du, dv, su, sv = unit.lights
-    return PictureView(x, y, du + su * 2 * x / sensor.field[1], dv + sv * 2 * y / sensor.field[0])
+    return PixelPositions(
+        x, y, du + su * 2 * x / sensor.field[1], dv + sv * 2 * y / sensor.field[0]
+    )
 
 
 def backdrop(
@@ -130,8 +132,8 @@ def backdrop(
 
     Pass it to `render` as `behind` if many frames of one unit are rendered outside of one `vmap`.
     """
-    resolution = resolution or picture_size(sensor)
-    place = picture_view(sensor, unit, resolution, stretched=stretched)
+    resolution = resolution or image_size(sensor)
+    place = pixel_positions(sensor, unit, resolution, stretched=stretched)
     shape = unit.base.shape
     rows = interpolation.spline((place.v + 1) / 2 * shape[0] - 0.5, shape[0])[0]
     columns = interpolation.spline((place.u + 1) / 2 * shape[1] - 0.5, shape[1])[0]
@@ -149,7 +151,7 @@ def backdrop(
     return image * left * light + grain[None]
 
 
-def _light(uneven: Leaf, tint: Leaf, place: PictureView, sensor: Sensor) -> Leaf:
+def _light(uneven: Leaf, tint: Leaf, place: PixelPositions, sensor: Sensor) -> Leaf:
     """Return the light (H, W) of one colour, relative to the nominal one.
 
     It falls on dents as on the untouched gel.
@@ -160,7 +162,7 @@ def _light(uneven: Leaf, tint: Leaf, place: PictureView, sensor: Sensor) -> Leaf
     return tint * relative * (1 - sensor.vignette * (u**2 + v**2) / 2)
 
 
-def render(  # noqa: PLR0913 - the call from before `Picture` and `Skin`
+def render(  # noqa: PLR0913 - the call from before `Rendering` and `Skin`
     displacement: Array | None,
     tangential: Array | None,
     pitch: float | Array,
@@ -174,19 +176,19 @@ def render(  # noqa: PLR0913 - the call from before `Picture` and `Skin`
     drift: Leaf | None = None,
     stretched: bool = False,
 ) -> Array:
-    """Render a skin as `show`, from the parts of its `Skin` and `Picture`.
+    """Render a skin as `show`, from the parts of its `Skin` and `Rendering`.
 
     A `displacement` of None is an untouched gel. `resolution` is by default square pixels with a
     short side of 224. Raises UserError for a sensor without a camera.
     """
-    picture = Picture(sensor, unit, resolution or picture_size(sensor), photometry, stretched)
+    camera = Rendering(sensor, unit, resolution or image_size(sensor), photometry, stretched)
     skin = None if displacement is None else Skin(displacement, tangential, pitch)
-    return show(skin, picture, key, behind=behind, drift=drift)
+    return show(skin, camera, key, behind=behind, drift=drift)
 
 
 def show(
     skin: Skin | None,
-    picture: Picture,
+    camera: Rendering,
     key: Array | None = None,
     *,
     behind: Array | None = None,
@@ -196,7 +198,7 @@ def show(
 
     Args:
         skin: The deformation, or None for an untouched gel.
-        picture: How the unit is shown. Its sensor and resolution are static under jit.
+        camera: How the unit is shown. Its sensor and resolution are static under jit.
         key: Draws the noise of the image. None omits it.
         behind: The `backdrop` of the same unit and resolution, if many frames share it.
         drift: (3, 3) change of the light since the background image (`sensors.draw_drift`).
@@ -204,15 +206,15 @@ def show(
     Raises:
         UserError: For a sensor without a camera.
     """
-    sensor = picture.sensor
-    unit = picture.unit
-    place = picture.view
-    photometry = look(sensor) if picture.photometry is None else picture.photometry
+    sensor = camera.sensor
+    unit = camera.unit
+    place = camera.view
+    photometry = look(sensor) if camera.photometry is None else camera.photometry
     change = _no_change if skin is None else _shading(skin, sensor, unit, photometry, place)
     ink = None
     if sensor.markers is not None:
         ink = unit.marked * _ink(skin, place, sensor.markers, sensor, unit)
-    bits = None if key is None else _pixel_bits(key, picture.resolution)
+    bits = None if key is None else _pixel_bits(key, camera.resolution)
 
     def channel(c: _Channel) -> Array:
         light = _light(c.uneven, c.tint, place, sensor)
@@ -228,7 +230,7 @@ def show(
         return jnp.round(jnp.clip(255 * image + noise, 0, 255)).astype(jnp.uint8)
 
     if behind is None:
-        behind = backdrop(sensor, unit, picture.resolution, stretched=picture.stretched)
+        behind = backdrop(sensor, unit, camera.resolution, stretched=camera.stretched)
     # A loop over the channels, not a broadcast: shared terms are computed once, and XLA's CPU
     # backend cannot fuse the arithmetic into the transpose, whose inner loop over three channels is
     # not vectorised (six times slower).
@@ -245,7 +247,7 @@ def _no_change(channel: _Channel) -> float:
 
 
 def _shading(
-    skin: Skin, sensor: Sensor, unit: Unit, photometry: Photometry, place: PictureView
+    skin: Skin, sensor: Sensor, unit: Unit, photometry: Photometry, place: PixelPositions
 ) -> Callable[[_Channel], Array | float]:
     """Return the change (H, W) of one channel by the dent, as a function of the channel."""
     displacement = skin.displacement
@@ -362,7 +364,7 @@ def background(sensor: Sensor, unit: Unit, key: Array | None = None, **options: 
     return render(None, None, 1.0, sensor, unit, key, **options)
 
 
-def onto_picture(
+def onto_image(
     maps: Array,
     *,
     pitch: Any,
@@ -382,13 +384,13 @@ def onto_picture(
         unit: The unit.
         resolution: (height, width) of the image.
         vectors: The two channels are x and y of a vector, which is mirrored with the image.
-        stretched: As in `picture_view`.
+        stretched: As in `pixel_positions`.
         grid: Size (rows, columns) of the solve grid if that of the maps is coarser.
 
     Returns:
         (..., height, width, C).
     """
-    place = picture_view(sensor, unit, resolution, stretched=stretched)
+    place = pixel_positions(sensor, unit, resolution, stretched=stretched)
     ay, ax = _enlarging(maps.shape[-3:-1], grid, pitch, place)
     mapped = jnp.einsum("ih,...hwc,jw->...ijc", ay, maps, ax)
     if vectors:
@@ -396,14 +398,14 @@ def onto_picture(
     return mapped
 
 
-def _resample(shape: tuple[int, ...], pitch: Any, place: PictureView) -> Matrices:
+def _resample(shape: tuple[int, ...], pitch: Any, place: PixelPositions) -> Matrices:
     """Return value and derivative matrices from the solve grid to the image's rows and columns."""
     rows = interpolation.spline(place.y / pitch + (shape[0] - 1) / 2, shape[0])
     return *rows, *interpolation.spline(place.x / pitch + (shape[1] - 1) / 2, shape[1])
 
 
 def _enlarging(
-    shape: tuple[int, ...], grid: Any, pitch: Any, place: PictureView
+    shape: tuple[int, ...], grid: Any, pitch: Any, place: PixelPositions
 ) -> tuple[Array, Array]:
     """Return the value matrices (rows, columns) from a map of `shape` to the image.
 
@@ -433,8 +435,10 @@ def _blurred(field: Array, sigma: Any) -> Array:
     return rows @ field @ columns.T
 
 
-def _ink(skin: Skin | None, place: PictureView, ink: Markers, sensor: Sensor, unit: Unit) -> Array:
-    """Return the share of ink (H, W): the lattice at the undeformed places of the skin.
+def _ink(
+    skin: Skin | None, place: PixelPositions, ink: Markers, sensor: Sensor, unit: Unit
+) -> Array:
+    """Return the fraction of ink (H, W): the lattice at the undeformed places of the skin.
 
     The skin at a pixel came from where it was before it moved, so the motion is subtracted.
     """
@@ -456,7 +460,7 @@ def _ink(skin: Skin | None, place: PictureView, ink: Markers, sensor: Sensor, un
 def ink_coverage(
     markers: Markers, x: Array, y: Array, phase: Leaf, size: Leaf, soft: Array, half: Any
 ) -> Array:
-    """Return the share of ink, 0..1, at places of the skin.
+    """Return the fraction of ink, 0..1, at places of the skin.
 
     Spots lie on a lattice and differ a little in size, as printed spots do.
 
@@ -496,7 +500,7 @@ def is_traced(value: Any) -> bool:
 def _pixel_bits(key: Array, shape: tuple[int, int]) -> Array:
     """Return a random word u32 (H, W) for each pixel: its number, mixed with the key.
 
-    It is cheaper than `jax.random.bits`, and a picture's noise needs no cryptography.
+    It is cheaper than `jax.random.bits`, and an image's noise needs no cryptography.
     """
     step = jnp.uint32(0x9E3779B9)  # 2^32 over the golden ratio: odd, and far from small numbers
     first, second = _mixed(jax.random.key_data(key) + step)

@@ -62,7 +62,7 @@ class OwnSensor:
     modulus_kpa: Annotated[float, Range(5, 5000, "5 to 5000 kPa")] = 150.0
     skin_mm: NotNegative[float] = 0.1  # smallest detail that the coating passes
     halo_mm: Above0[float] = 1.0  # width of the soft shadow
-    contrast: Finite[float] = 1.0  # of dents, over that of the pictures
+    contrast: Finite[float] = 1.0  # of dents, over that of the images
     # variation of simulated devices: 1 is that of a product
     spread: Annotated[float, Range(0, 1, "0 to 1")] = 0.3
     sure: dict = field(default_factory=dict)

@@ -1,4 +1,4 @@
-"""Photographs of the touched place: a shaded height map, with random view, light and background.
+"""RGB images of the touched place: a shaded height map, with random view, light and background.
 
 They are RGB images for the vision tower. Everything is a plane of float32, because a data set and
 training make thousands of them.
@@ -33,7 +33,7 @@ class CameraView:
 
 
 def seeded_photograph(job: tuple[Object, Any, Sequence[int]], size: int) -> np.ndarray:
-    """Return `photograph` of an object, a place and a seed, for a pool of processes."""
+    """Return `RGB image` of an object, a place and a seed, for a pool of processes."""
     thing, place, seed = job
     rng = np.random.default_rng([*seed, *np.asarray(place, np.float32).view(np.uint32)])
     return photograph(thing, place, rng, size)
@@ -42,7 +42,7 @@ def seeded_photograph(job: tuple[Object, Any, Sequence[int]], size: int) -> np.n
 def photograph(
     thing: Object, place_mm: Any, rng: np.random.Generator, size: int = 224
 ) -> np.ndarray:
-    """Return an RGB photograph u8 (size, size, 3) of an object.
+    """Return an RGB RGB image u8 (size, size, 3) of an object.
 
     Args:
         thing: The object.
@@ -107,14 +107,14 @@ def _draw_view(rng: np.random.Generator) -> CameraView:
     )
 
 
-def _remap(picture: Image, column: Image, row: Image) -> Image:
+def _remap(image: Image, column: Image, row: Image) -> Image:
     return np.asarray(
-        cv2.remap(picture, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT), np.float32
+        cv2.remap(image, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT), np.float32
     )
 
 
-def _blur(picture: Image, pixels: float) -> Image:
-    return np.asarray(cv2.GaussianBlur(picture, (0, 0), pixels), np.float32)
+def _blur(image: Image, pixels: float) -> Image:
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), pixels), np.float32)
 
 
 def _dot(a: Planes, b: Any) -> Image:
@@ -140,15 +140,15 @@ def _trace(
     ]
     lean_x: Image = ray[0] / ray[2]
     lean_y: Image = ray[1] / ray[2]
-    # The touched place, not the plane z = 0, is in the middle of the picture.
+    # The touched place, not the plane z = 0, is in the middle of the image.
     top = float(base(shape, np.float32(place[:1]), np.float32(place[1:]))[0])
     x0 = np.float32(place[0] + view.eye[0]) - lean_x * np.float32(view.eye[2] + top)
     y0 = np.float32(place[1] + view.eye[1]) - lean_y * np.float32(view.eye[2] + top)
 
-    def step(z: Image, every: int, share: float) -> Image:
+    def step(z: Image, every: int, fraction: float) -> Image:
         """Return one step to the fixed point of z = base(ray at z), damped for steep sides."""
         rough = [a[::every, ::every] for a in (x0, y0, lean_x, lean_y)]
-        return (1 - share) * z + share * base(
+        return (1 - fraction) * z + fraction * base(
             shape, rough[0] + rough[2] * z, rough[1] + rough[3] * z
         )
 
@@ -177,7 +177,7 @@ def _fine(shape: Shape, x: Image, y: Image, where: npt.NDArray[np.bool_]) -> tup
     finest = shape.texture_pitch
     if shape.grain != "none":
         finest = min(shape.grain_pitch, shape.texture_pitch)
-    # mm, about one pixel of a photograph of 224
+    # mm, about one pixel of an RGB image of 224
     step = float(np.clip(finest / 6, 0.15, 0.25))
     axes = []
     places = []

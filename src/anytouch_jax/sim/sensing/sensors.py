@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
-from anytouch_jax.data.background.layout import known_gels
+from anytouch_jax.data.background.layout import known_backgrounds
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import read_arrays
 from anytouch_jax.sensors import RECORDS, Markers
@@ -85,6 +85,7 @@ def _simulated(name: str, **appearance: Any) -> Sensor:
     """Return the simulated form of a sensor: its record, and how it looks."""
     record = RECORDS[name]
     assert record.size_mm is not None and record.pixels is not None
+    assert record.modulus_kpa is not None and record.thickness_mm is not None
     return Sensor(
         name,
         record.size_mm,
@@ -134,7 +135,7 @@ def bases(sensor: Sensor) -> Array:
         bases_of = stored["bases"]
     else:
         # of real units; the core knows these, because it checks cameras by them
-        bases_of = np.stack(known_gels(sensor.name))
+        bases_of = np.stack(known_backgrounds(sensor.name))
     if bases_of.dtype == np.uint8:
         return bases_of.astype(np.float32) / 255
     return bases_of
@@ -163,7 +164,7 @@ class Unit(NamedTuple):
     lights: Leaf  # (4,) shift and stretch along u and v of the place that the lights see
     uneven: Leaf  # (5, 3) relative brightness on u, v, u^2, uv, v^2
     focus: Leaf  # mm, blur of the lens
-    # (SPECKS, 6): place (u, v), radius mm, share of each colour that dirt or wear absorbs
+    # (SPECKS, 6): place (u, v), radius mm, fraction of each colour that dirt or wear absorbs
     specks: Leaf
     # (2,) standard deviation (0 to 255) and seed of the fixed pattern of a camera and a gel
     grain: Leaf
@@ -173,7 +174,7 @@ class Unit(NamedTuple):
     marker_pitch: Leaf  # factor on the markers' pitch
     marker_phase: Leaf  # (2,) of a lattice step
     marker_size: Leaf  # factor on the markers' radius
-    zoom: Leaf  # share of the field in the image, at most 1
+    zoom: Leaf  # fraction of the field in the image, at most 1
     window: Leaf  # (2,) mm (x, y), middle of that part
     mirror: Leaf  # (2,) +-1 along x and y
     rotation: Leaf  # rad of the object
@@ -229,7 +230,7 @@ def draw_unit(
 ) -> Unit:
     """Draw a unit of a sensor.
 
-    "Measured" is on real pictures scaled to 128 pixels: GelSight Mini with dots (8 gels, 39
+    "Measured" is on real images scaled to 128 pixels: GelSight Mini with dots (8 gels, 39
     recordings) and without (3 units), DIGIT (3 units), 9DTact (3 units).
 
     All sensors draw equally often and in the order below, so that they can share a stream of
@@ -244,7 +245,7 @@ def draw_unit(
     """
     xp = namespace_of(rng)
     spread = sensor.spread
-    marked_share = sensor.markers.share if sensor.markers else 0.0
+    marked_fraction = sensor.markers.fraction if sensor.markers else 0.0
     # Measured: the dots of the 8 gels are 0.131 or 0.183 short sides apart, which is 1.85 mm at a
     # zoom of 1 or 0.72.
     zoom = 1 + spread * (rng.uniform(0.68, 1.0) - 1)
@@ -261,7 +262,7 @@ def draw_unit(
     uneven = spread * rng.normal(0, 0.08, (5, 3))  # on top of the measured ones in `base`
     focus = rng.uniform(0.02, 0.15)
     specks = _draw_specks(dirt, rng)
-    # Measured: 0.5 to 2.5 levels of fine structure in an untouched picture.
+    # Measured: 0.5 to 2.5 levels of fine structure in an untouched image.
     grain = [xp.exp(rng.uniform(math.log(0.3), math.log(2))), rng.integers(2**24)]
     return _unit(
         base=base,
@@ -275,7 +276,7 @@ def draw_unit(
         grain=grain,
         thickness=xp.exp(rng.normal(0, 0.08)),
         modulus=xp.exp(rng.normal(0, 0.15)),
-        marked=rng.uniform() < marked_share,
+        marked=rng.uniform() < marked_fraction,
         marker_pitch=1 + spread * (rng.uniform(0.92, 1.08) - 1),
         marker_phase=rng.uniform(0, 1, 2),
         marker_size=1 + spread * (rng.uniform(0.8, 1.25) - 1),  # measured: radii of 0.30 to 0.44 mm

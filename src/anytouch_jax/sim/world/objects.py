@@ -360,15 +360,17 @@ def draw_object(primitive: str, texture: str, material: str, seed: int) -> Objec
 
 
 def hold_out(
-    objects: Sequence[Object], share: float, seed: int
+    objects: Sequence[Object], fraction: float, seed: int
 ) -> tuple[tuple[Object, ...], tuple[Object, ...]]:
     """Split objects into (training, held out) that share no (primitive, texture) pair.
 
-    Both keep their order. At least `share` is held out. Training objects keep every primitive and
-    texture, so that a held-out pair is new only as a pair. Raises UserError otherwise.
+    Both keep their order. At least `fraction` is held out. Training objects keep every primitive
+    and texture, so that a held-out pair is new only as a pair. Raises UserError otherwise.
     """
-    if not 0 < share < 1:
-        raise UserError(f"the share of objects held out must lie between 0 and 1, not {share}")
+    if not 0 < fraction < 1:
+        raise UserError(
+            f"the fraction of objects held out must lie between 0 and 1, not {fraction}"
+        )
     pairs = sorted({o.kind for o in objects})
     sizes = Counter(o.kind for o in objects)
     primitives = Counter(p for p, _ in pairs)
@@ -376,7 +378,7 @@ def hold_out(
     test_pairs: set[Pair] = set()
     test_objects = 0
     for i in np.random.default_rng([seed, 12]).permutation(len(pairs)):
-        if test_objects >= share * len(objects):
+        if test_objects >= fraction * len(objects):
             break
         primitive, texture = pairs[i]
         if primitives[primitive] > 1 and textures[texture] > 1:
@@ -384,10 +386,10 @@ def hold_out(
             primitives[primitive] -= 1
             textures[texture] -= 1
             test_objects += sizes[pairs[i]]
-    if test_objects < share * len(objects):
+    if test_objects < fraction * len(objects):
         raise UserError(
             f"of {len(objects)} objects only {test_objects} can be held out without losing a "
-            f"primitive or a texture; ask for less than {share:g} of them or draw more objects"
+            f"primitive or a texture; ask for less than {fraction:g} of them or draw more objects"
         )
     training = tuple(o for o in objects if o.kind not in test_pairs)
     return training, tuple(o for o in objects if o.kind in test_pairs)

@@ -158,15 +158,15 @@ def _knit(u: Array, v: Array, pitch: float, seed: int) -> Array:
     # rows are 0.75 pitches high, legs lean 0.5 radians
     xp = namespace(u)
     row = 0.75
-    lean = 0.5
+    remat = 0.5
     fold = xp.abs(s - xp.round(s)) - 0.26  # both legs of a V at once
     r = t / row
     r = r - xp.round(r)
     total = 0.0 * (u + v)
     for offset in (-1.0, 0.0, 1.0):
         along = (r + offset) * row
-        a = math.cos(lean) * along + math.sin(lean) * fold
-        b = math.cos(lean) * fold - math.sin(lean) * along
+        a = math.cos(remat) * along + math.sin(remat) * fold
+        b = math.cos(remat) * fold - math.sin(remat) * along
         total = _larger(total, _bump((a / 0.62) ** 2 + (b / 0.25) ** 2), 0.06)
     return xp.clip((total - 0.06) / 0.9, 0, 1)
 
@@ -244,7 +244,7 @@ class Shape:
     `size` is the radius of a sphere, cylinder, screw, ring, flat face or cone's base, the rim's
     radius of an edge or corner, or the height of a letter. The texture is between 0 and
     -`texture_depth` under the primitive, rotated by `texture_angle`. `irregularity` bends a
-    repeating texture by this share of its pitch. The `grain` is a second, finer texture. Raises
+    repeating texture by this fraction of its pitch. The `grain` is a second, finer texture. Raises
     UserError for an unknown name, a size or pitch of 0 or less, or a negative depth.
     """
 
@@ -460,8 +460,10 @@ def _distance(letter: str, x: Array, y: Array) -> Array:
         for (ax, ay), (bx, by) in pairwise(line):
             dx = bx - ax
             dy = by - ay
-            share = xp.clip(((x - ax) * dx + (y - ay) * dy) / (dx * dx + dy * dy), 0, 1)
-            nearest = xp.minimum(nearest, (x - ax - share * dx) ** 2 + (y - ay - share * dy) ** 2)
+            fraction = xp.clip(((x - ax) * dx + (y - ay) * dy) / (dx * dx + dy * dy), 0, 1)
+            nearest = xp.minimum(
+                nearest, (x - ax - fraction * dx) ** 2 + (y - ay - fraction * dy) ** 2
+            )
     return xp.sqrt(nearest)
 
 

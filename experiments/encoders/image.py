@@ -1,4 +1,4 @@
-"""The picture of the README: the example touches, and how alike their features are.
+"""The image of the README: the example touches, and how alike their features are.
 
 python -m experiments.encoders.picture docs/pictures/first_touch.png
 """
@@ -63,7 +63,7 @@ def draw(out: Path, model: str = "anytouch-tiny") -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("out", type=Path, help="the picture to write")
+    parser.add_argument("out", type=Path, help="the image to write")
     parser.add_argument(
         "model", nargs="?", default="anytouch-tiny", help="name or path of an encoder"
     )

@@ -2,8 +2,8 @@ import io
 from pathlib import Path
 
 import numpy as np
-from films import write_film
 from PIL import Image
+from videos import write_video
 
 from anytouch_jax.data.images import decode
 from tests.fuzz.harness import Case, cut, flipped, pick
@@ -11,8 +11,8 @@ from tests.fuzz.harness import Case, cut, flipped, pick
 FORMATS = ("png", "jpg", "tiff", "bmp", "webp", "npy")
 
 
-def picture(rng) -> np.ndarray:
-    """A smooth picture that every format keeps nearly unchanged, RGB."""
+def image(rng) -> np.ndarray:
+    """A smooth image that every format keeps nearly unchanged, RGB."""
     height, width = rng.integers(24, 72, 2)
     y, x = np.mgrid[:height, :width] / max(height, width)
     waves = [np.sin(x * a + y * b + c) for a, b, c in rng.uniform(0, 5, (3, 3))]
@@ -32,7 +32,7 @@ def encoded(pixels: np.ndarray, ending: str, **options) -> bytes:
 
 def changed(rng) -> tuple[str, bytes, str, bool, np.ndarray | None]:
     """Return (name, bytes, ending, may be accepted, pixels that it must then have or None)."""
-    pixels = picture(rng)
+    pixels = image(rng)
     ending = pick(rng, FORMATS)
     kind = pick(
         rng, "whole, other, padded, cut, cut, hole, flipped, flipped, header, header, array"
@@ -80,14 +80,14 @@ def changed(rng) -> tuple[str, bytes, str, bool, np.ndarray | None]:
 
 def make(rng, folder: Path, things) -> Case:
     if rng.random() < 0.05:
-        return film(rng, folder, things)
+        return video(rng, folder, things)
     name, data, ending, fine, pixels = changed(rng)
     file = folder / "frames" / f"1.{ending}"
     file.parent.mkdir()
     file.write_bytes(data)
     for place, seed in (("0", 1), ("2", 2)):
         (folder / "frames" / f"{place}.{ending}").write_bytes(
-            encoded(picture(np.random.default_rng(seed)), ending)
+            encoded(image(np.random.default_rng(seed)), ending)
         )
     manifest = folder / "m.csv"
     rows = [f"frames/{i}.{ending},digit,s,{i},train" for i in range(3)]
@@ -102,7 +102,7 @@ def make(rng, folder: Path, things) -> Case:
         "verify": ("data", "verify", manifest),
         "manifest": (*embed, "--data", manifest),
         "folder": (*embed, "--data", file.parent),
-        "picture": (*embed, "--data", file),
+        "image": (*embed, "--data", file),
         "contact": ("data", "contact", manifest, "--out", folder / "c.csv"),
         "background": (
             "data",
@@ -116,7 +116,7 @@ def make(rng, folder: Path, things) -> Case:
         "pack": ("data", "pack", manifest, "--out", folder / "packed" / "m.csv"),
     }
     command = pick(
-        rng, ("verify",) * 8 + ("manifest", "folder", "picture", "contact", "background", "pack")
+        rng, ("verify",) * 8 + ("manifest", "folder", "image", "contact", "background", "pack")
     )
 
     def check():
@@ -136,9 +136,9 @@ def make(rng, folder: Path, things) -> Case:
     )
 
 
-def film(rng, folder: Path, things) -> Case:
+def video(rng, folder: Path, things) -> Case:
     file = folder / f"film.{pick(rng, ('avi', 'mp4'))}"
-    write_film(file, (rng.integers(0, 256, (32, 32, 3), np.uint8) for _ in range(8)))
+    write_video(file, (rng.integers(0, 256, (32, 32, 3), np.uint8) for _ in range(8)))
     data = file.read_bytes()
     kind = pick(rng, ("cut", "flipped", "header", "nothing"))
     changes = {
@@ -149,4 +149,4 @@ def film(rng, folder: Path, things) -> Case:
     file.write_bytes(changes.get(kind, flipped(rng, data, 0, 200, 6)))
     command = pick(rng, ("embed", "stream"))
     words = (command, "--model", things.run, "--data", file, "--out", folder / "f.npz")
-    return Case(f"film, {kind}, {command}", words, kind == "nothing")
+    return Case(f"video, {kind}, {command}", words, kind == "nothing")

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from anytouch_jax.errors import UserError
-from anytouch_jax.fields import film as films
-from anytouch_jax.fields.film import Film
+from anytouch_jax.fields import video as videos
+from anytouch_jax.fields.video import Video
 
 
-def pictures(count: int = 12) -> list[np.ndarray]:
+def images(count: int = 12) -> list[np.ndarray]:
     return [np.full((48, 64, 3), 10 * number, np.uint8) for number in range(count)]
 
 
@@ -27,52 +27,52 @@ def read(path) -> tuple[float, list[float]]:
 
 
 @pytest.mark.parametrize("name", ["shown.avi", "shown.mp4"])
-def test_a_film_has_the_rate_and_the_frames_that_it_was_given(tmp_path, name):
-    film = Film(tmp_path / name, 12.5)
-    for picture in pictures():
-        film.add(picture)
+def test_a_video_has_the_rate_and_the_frames_that_it_was_given(tmp_path, name):
+    video = Video(tmp_path / name, 12.5)
+    for image in images():
+        video.add(image)
     assert not (tmp_path / name).exists(), "it is moved to its place when it is whole"
-    film.finish()
+    video.finish()
     rate, frames = read(tmp_path / name)
     assert rate == pytest.approx(12.5, rel=1e-3) and len(frames) == 12
     np.testing.assert_allclose(frames, 10 * np.arange(12), atol=6)
-    film.close()
+    video.close()
     assert [file.name for file in tmp_path.iterdir()] == [name]
 
 
-def test_what_is_not_finished_leaves_an_earlier_film_alone(tmp_path):
+def test_what_is_not_finished_leaves_an_earlier_video_alone(tmp_path):
     path = tmp_path / "shown.avi"
     path.write_bytes(b"an earlier film")
-    film = Film(path)
-    film.add(pictures()[0])
-    film.close()
+    video = Video(path)
+    video.add(images()[0])
+    video.close()
     assert path.read_bytes() == b"an earlier film" and list(tmp_path.iterdir()) == [path]
 
 
 @pytest.mark.parametrize("name", ["shown.avi", "shown.mp4"])
 @pytest.mark.parametrize("kept", [0.0, 0.5, 0.95])
-def test_a_film_that_is_cut_short_is_an_error(tmp_path, monkeypatch, name, kept):
+def test_a_video_that_is_cut_short_is_an_error(tmp_path, monkeypatch, name, kept):
     """OpenCV writes what the disk takes, and says nothing about the rest."""
     path = tmp_path / name
     rng = np.random.default_rng(0)
     for free, error in ((0, OSError), (1 << 30, UserError)):
-        film = Film(path)
+        video = Video(path)
         for _ in range(40):
-            film.add(rng.integers(0, 256, (120, 160, 3), np.uint8))
-        writer = film._writer
+            video.add(rng.integers(0, 256, (120, 160, 3), np.uint8))
+        writer = video._writer
 
         class Cut:
-            def release(self, writer=writer, part=film._part):
+            def release(self, writer=writer, part=video._part):
                 writer.release()
                 data = part.read_bytes()
                 part.write_bytes(data[: int(kept * len(data))])
 
-        film._writer = Cut()
+        video._writer = Cut()
         usage = SimpleNamespace(free=free)
-        monkeypatch.setattr(films.shutil, "disk_usage", lambda _, usage=usage: usage)
+        monkeypatch.setattr(videos.shutil, "disk_usage", lambda _, usage=usage: usage)
         with pytest.raises(error, match="No space left" if error is OSError else "whole") as told:
-            film.finish()
+            video.finish()
         if error is OSError:
             assert told.value.errno == errno.ENOSPC and told.value.filename == str(path)
-        film.close()
+        video.close()
         assert list(tmp_path.iterdir()) == []

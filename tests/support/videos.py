@@ -1,4 +1,4 @@
-"""Films on disk."""
+"""Videos on disk."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 
 
-def write_film(
+def write_video(
     path: str | Path, frames: Iterable[np.ndarray], rate: float = 10, code: str = ""
 ) -> Path:
-    """Write frames BGR u8 (H, W, 3) to a film in the codec `code`, or in that of its ending."""
+    """Write frames BGR u8 (H, W, 3) to a video in the codec `code`, or in that of its ending."""
     path = Path(path)
     frames = list(frames)
     path.parent.mkdir(parents=True, exist_ok=True)

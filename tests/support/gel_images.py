@@ -1,4 +1,4 @@
-"""Pictures of a gel, untouched or pressed."""
+"""Images of a gel, untouched or pressed."""
 
 import numpy as np
 

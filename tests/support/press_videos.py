@@ -1,4 +1,4 @@
-"""Films of a gel that is pressed for a share of the time, in three looks: lit in colours,
+"""Videos of a gel that is pressed for a fraction of the time, in three looks: lit in colours,
 darkening, and with dots.
 """
 
@@ -19,44 +19,44 @@ def gel_frame(
     rng = np.random.default_rng(seed)
     dent = depth * _dent(shape, x - 80 - shift, y - 60)
     if look == "darkening":  # as of a 9DTact: pressed gel is darker
-        picture = 165 - ((x - 80) ** 2 + (y - 60) ** 2) / 560 - 34 * dent
-        picture = np.repeat(picture[..., None], 3, 2)
+        image = 165 - ((x - 80) ** 2 + (y - 60) ** 2) / 560 - 34 * dent
+        image = np.repeat(image[..., None], 3, 2)
     else:
-        picture = np.dstack(
+        image = np.dstack(
             [90 + 30 * np.exp(-((x - 80) ** 2 + (y - 60) ** 2) / 3000), 100 + 0 * x, 80 + y / 6]
         )
         contrast = 280 if look == "dotted" else 180
-        picture[..., 0] += contrast * np.gradient(dent, axis=1)
-        picture[..., 2] += contrast * np.gradient(dent, axis=0)
+        image[..., 0] += contrast * np.gradient(dent, axis=1)
+        image[..., 2] += contrast * np.gradient(dent, axis=0)
     if look == "dotted":
         for row in range(10, SHAPE[0], 16):
             for column in range(10, SHAPE[1], 16):
                 near = np.exp(-((row - 60) ** 2 + (column - 80 - shift) ** 2) / 40**2)
                 middle = column + 5 * depth * near  # shear moves the dots
                 part = np.s_[row - 3 : row + 4, max(int(middle) - 3, 0) : int(middle) + 5]
-                picture[part][(y[part] - row) ** 2 + (x[part] - middle) ** 2 < 2.5**2] = 20
-    picture *= 1 + 0.02 * np.sin(seed)  # exposure drifts
-    return np.clip(picture + rng.normal(0, 1.2, picture.shape), 0, 255).astype(np.uint8)
+                image[part][(y[part] - row) ** 2 + (x[part] - middle) ** 2 < 2.5**2] = 20
+    image *= 1 + 0.02 * np.sin(seed)  # exposure drifts
+    return np.clip(image + rng.normal(0, 1.2, image.shape), 0, 255).astype(np.uint8)
 
 
-def press_film(
-    look: str, share: float, shape: str = "ball", frames: int = 40
+def press_video(
+    look: str, fraction: float, shape: str = "ball", frames: int = 40
 ) -> tuple[list[np.ndarray], np.ndarray]:
-    """Return the frames of one film and whether each is pressed: free, a press that slides,
+    """Return the frames of one video and whether each is pressed: free, a press that slides,
     free.
     """
-    pressed = round(share * frames)
+    pressed = round(fraction * frames)
     first = (frames - pressed + 1) // 2
     contact = (np.arange(frames) >= first) & (np.arange(frames) < first + pressed)
-    seed = LOOKS.index(look) * 1000 + round(share * 100)
-    pictures = []
+    seed = LOOKS.index(look) * 1000 + round(fraction * 100)
+    images = []
     for number in range(frames):
         place = (number - first + 0.5) / max(pressed, 1)
         depth = (0.6 + 0.4 * np.sin(np.pi * place)) * contact[number]
-        pictures.append(
+        images.append(
             gel_frame(look, depth, shape, 14 * (place - 0.5) * contact[number], seed + number)
         )
-    return pictures, contact
+    return images, contact
 
 
 def _dent(shape: str, x: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -7,11 +7,11 @@ from concurrent.futures import ThreadPoolExecutor
 import cv2
 import numpy as np
 import pytest
-from films import write_film
 from PIL import Image
 from refused import refused
+from videos import write_video
 
-from anytouch_jax.data import images, picture_headers
+from anytouch_jax.data import image_headers, images
 from anytouch_jax.data.images import ImageError, decode_bytes
 
 RGB = np.random.default_rng(0).integers(0, 256, (16, 24, 3), np.uint8)
@@ -58,13 +58,13 @@ def _many_chunks(chunk: bytes, count: int, at: int = 33) -> bytes:
     ],
     ids=["scans", "fill", "zeros", "restarts", "comments", "exif", "gamma", "data", "text"],
 )
-def test_a_picture_that_would_take_minutes_is_refused(data, words, monkeypatch):
+def test_a_image_that_would_take_minutes_is_refused(data, words, monkeypatch):
     monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
     refused(f"hostile cannot be read: .*{words}", decode_bytes, data, "hostile")
 
 
 def test_the_limit_of_scans_falls_with_the_size(monkeypatch):
-    monkeypatch.setattr(picture_headers, "MAX_CODED", 20 * (1 << 16))
+    monkeypatch.setattr(image_headers, "MAX_CODED", 20 * (1 << 16))
     refused("more than 20 scans", decode_bytes, _many_scans(30), "x")
     hidden = (
         _many_scans(0)[:-2] + b"\xff\xfe\0\4\xff\xd9" + _many_scans(30)[len(_many_scans(0)) - 2 :]
@@ -96,7 +96,7 @@ def test_a_broken_tiff_or_bmp_prints_nothing_of_opencv(capfd):
     assert capfd.readouterr() == ("", "")
 
 
-def test_an_animation_gives_its_first_picture():
+def test_an_animation_gives_its_first_image():
     moving = _saved("PNG", save_all=True, append_images=[Image.fromarray(255 - RGB)])
     np.testing.assert_array_equal(decode_bytes(moving, "x"), RGB)
 
@@ -133,7 +133,7 @@ def test_decoders_print_nothing_and_no_thread_loses_a_line(capfd, tmp_path):
 @pytest.mark.parametrize(("code", "ending"), [("MJPG", "avi"), ("mp4v", "mp4")])
 def test_videos_print_nothing(capfd, tmp_path, code, ending):
     path = tmp_path / f"film.{ending}"
-    write_film(path, (cv2.resize(RGB, (64, 48)) for _ in range(12)), code=code)
+    write_video(path, (cv2.resize(RGB, (64, 48)) for _ in range(12)), code=code)
     data = path.read_bytes()
     rng = np.random.default_rng(0)
     capfd.readouterr()
@@ -158,7 +158,7 @@ def test_a_declared_size_beyond_the_limit_is_refused_before_it_is_unpacked(suffi
     if suffix == "tags.webp":  # another header
         data = _saved("webp", exif=b"Exif\0\0")
     assert decode_bytes(data, "x").shape == (16, 24, 3)
-    monkeypatch.setattr(picture_headers, "MAX_PIXELS", 16 * 24 - 1)
+    monkeypatch.setattr(image_headers, "MAX_PIXELS", 16 * 24 - 1)
     monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was unpacked"))
     refused("it declares 24 x 16 pixels", decode_bytes, data, "x")
 
@@ -235,7 +235,7 @@ def _declared(shape, kind):
         (_declared((4, 4, 3), "<M8[s]"), "cut short"),
     ],
 )
-def test_an_array_that_is_no_picture_or_declares_more_than_it_has_is_refused(data, words):
+def test_an_array_that_is_no_image_or_declares_more_than_it_has_is_refused(data, words):
     refused(rf"x\.npy.*{words}", decode_bytes, data, "x.npy")
 
 
@@ -243,9 +243,9 @@ def test_an_array_that_is_no_picture_or_declares_more_than_it_has_is_refused(dat
 def test_cut_files_are_refused(kind):
     large = np.random.default_rng(1).integers(0, 256, (64, 64, 3), np.uint8)
     data = _array(large) if kind == "npy" else _saved(kind, large)
-    for share in (0.0, 0.02, 0.3, 0.6, 0.95):
+    for fraction in (0.0, 0.02, 0.3, 0.6, 0.95):
         with pytest.raises(ImageError, match=r"cut(\.npy)? cannot be read"):
-            decode_bytes(data[: int(share * len(data))], "cut.npy" if kind == "npy" else "cut")
+            decode_bytes(data[: int(fraction * len(data))], "cut.npy" if kind == "npy" else "cut")
 
 
 def _png(rows: bytes, *, depth: int = 8, colour: int = 2, lace: int = 0) -> bytes:

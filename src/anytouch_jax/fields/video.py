@@ -20,8 +20,8 @@ RATE = 30.0  # frames a second of what has no rate of its own
 _FULL = 1 << 16  # bytes: a disk with less is full
 
 
-class Film:
-    """A video of pictures RGB u8 of one size, that of the first: others are scaled to it.
+class Video:
+    """A video of images RGB u8 of one size, that of the first: others are scaled to it.
 
     It is written to a hidden file beside its place, and `finish` moves it there.
 
@@ -40,24 +40,24 @@ class Film:
         self._count = 0
         self._writer: Any = None
 
-    def add(self, picture: np.ndarray) -> None:
-        """Write a picture. Raises UserError if this computer cannot write such a video."""
+    def add(self, image: np.ndarray) -> None:
+        """Write an image. Raises UserError if this computer cannot write such a video."""
         if self._writer is None:
-            self._open(picture)
-        if picture.shape[1::-1] != self._size:
-            picture = cv2.resize(picture, self._size)
-        self._writer.write(picture[..., ::-1])
+            self._open(image)
+        if image.shape[1::-1] != self._size:
+            image = cv2.resize(image, self._size)
+        self._writer.write(image[..., ::-1])
         self._count += 1
 
-    def _open(self, picture: np.ndarray) -> None:
+    def _open(self, image: np.ndarray) -> None:
         code = "MJPG" if self._path.suffix == ".avi" else "mp4v"
-        self._size = (picture.shape[1], picture.shape[0])
+        self._size = (image.shape[1], image.shape[0])
         fourcc = cv2.VideoWriter.fourcc(*code)
         with name_for_opencv(self._part) as name:
             self._writer = cv2.VideoWriter(name, fourcc, self._rate, self._size)
         if not self._writer.isOpened():
             raise UserError(
-                f"{self._path} cannot be written as a film on this computer. Name an .avi file."
+                f"{self._path} cannot be written as a video on this computer. Name an .avi file."
             )
 
     def finish(self, path: Path | None = None) -> None:

@@ -1,6 +1,6 @@
-"""Headers of picture files, checked before OpenCV unpacks them.
+"""Headers of image files, checked before OpenCV unpacks them.
 
-A small hostile or damaged file can declare a picture of gigabytes, hide hours of work in a JPEG of
+A small hostile or damaged file can declare an image of gigabytes, hide hours of work in a JPEG of
 thousands of scans, or be cut so that OpenCV fills its lost part with grey. So the header of each
 file is walked here first, with limits. `tests/data/test_hostile_pictures.py` has such files.
 """
@@ -25,7 +25,7 @@ from PIL import (
 from anytouch_jax.data.pixels import MAX_PIXELS
 from anytouch_jax.files import placeholder
 
-MAX_CODED = 16 * MAX_PIXELS  # pixels times scans of a JPEG: each scan goes over the whole picture
+MAX_CODED = 16 * MAX_PIXELS  # pixels times scans of a JPEG: each scan goes over the whole image
 MAX_PARTS = 1 << 12  # chunks or segments of a header, which Pillow reads one by one
 MAX_PADDING = 1 << 16  # bytes between the segments of a JPEG, which Pillow reads one by one
 
@@ -56,7 +56,7 @@ _DECODED_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")
 
 
 def check_header(data: bytes) -> int:
-    """Return the EXIF orientation of a picture file, 1 to 8 (1 for a TIFF).
+    """Return the EXIF orientation of an image file, 1 to 8 (1 for a TIFF).
 
     Raises:
         ValueError: Unless OpenCV unpacks `data` whole and safely.
@@ -66,7 +66,7 @@ def check_header(data: bytes) -> int:
         kind = placeholder(data)
         if kind:
             raise ValueError(f"it is {kind}")
-        raise ValueError("it is not a PNG, JPEG, TIFF, BMP, WebP or .npy picture")
+        raise ValueError("it is not a PNG, JPEG, TIFF, BMP, WebP or .npy image")
     is_jpeg = data.startswith(JPEG)
     if is_jpeg:
         _check_segments(data)
@@ -104,7 +104,7 @@ def _orientation(image: ImageFile.ImageFile) -> int:
     _ignore_warnings_of_tags()
     try:
         value = image.getexif().get(_ORIENTATION, 1)
-    except Exception:  # a corrupt tag; the picture itself may be whole
+    except Exception:  # a corrupt tag; the image itself may be whole
         return 1
     if value in range(1, 9):
         return value
@@ -137,7 +137,7 @@ def decoded_chunks(data: bytes) -> bytes:
         kind = data[at + 4 : at + 8]
         end = at + 12 + length  # length, kind, content, checksum
         if end > len(data):
-            raise ValueError("the picture is corrupt or cut short")
+            raise ValueError("the image is corrupt or cut short")
         if kind in _DECODED_CHUNKS:
             parts.append(data[at:end])
         at = end
@@ -146,7 +146,7 @@ def decoded_chunks(data: bytes) -> bytes:
         if count > MAX_PARTS + at // 256:
             raise ValueError(f"it has more than {MAX_PARTS} chunks of a few bytes")
     if headers != 1 or data[12:16] != b"IHDR":
-        raise ValueError("the picture is corrupt")
+        raise ValueError("the image is corrupt")
     if len(parts) <= count:
         return b"".join(parts)
     return data
@@ -200,7 +200,7 @@ def _tiff_size(stream: io.BytesIO) -> tuple[int, int]:
     Pillow's image class knows no float colours, so only its directory reader is used.
 
     Raises:
-        ValueError: For a stack of pictures, of which OpenCV reads the first only, and for 8-bit
+        ValueError: For a stack of images, of which OpenCV reads the first only, and for 8-bit
             colours with unassociated alpha, by which OpenCV multiplies them.
     """
     _ignore_warnings_of_tags()
@@ -211,11 +211,11 @@ def _tiff_size(stream: io.BytesIO) -> tuple[int, int]:
     count = int.from_bytes(data[start : start + 2], order)
     entries = [data[at : at + 2] for at in range(start + 2, start + 2 + 12 * count, 12)]
     if len(set(entries)) < count:  # decoders take the first or the last
-        raise ValueError("the picture is corrupt: it has a tag twice")
+        raise ValueError("the image is corrupt: it has a tag twice")
     stream.seek(start)
     tags.load(stream)
     if tags.next:
-        raise ValueError("it holds several pictures; write a file for each")
+        raise ValueError("it holds several images; write a file for each")
     if tags.get(_ALPHA) in (2, (2,)) and tags.get(_BITS, (0,))[0] == 8:
         raise ValueError(
             "it has an alpha channel by which its colours would be multiplied; write it without "

@@ -1,4 +1,4 @@
-"""Pictures and surfaces of measured fields: depth in colour, an overlay, a mesh."""
+"""Images and surfaces of measured fields: depth in colour, an overlay, a mesh."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from anytouch_jax.data.background.estimate import without_islands
 from anytouch_jax.encoder.arrays import Array
 from anytouch_jax.encoder.measured import Fields
 from anytouch_jax.fields.outputs import LENGTH
@@ -17,7 +18,7 @@ _ARROWS = 14  # along the shorter side
 _LONGER = 4  # times its length is how a shear is drawn
 _OPAQUE = np.float32(0.7)  # the most that the colours of depth cover a frame
 _ABOUT = (
-    "comment unit: mm (widths of the picture, if its width in mm is not known)\n"
+    "comment unit: mm (widths of the image, if its width in mm is not known)\n"
     "comment frame: right-handed, x right, y down, z away from the camera (REP 103)\n"
 )
 _GREEN = (120, 255, 120)
@@ -34,7 +35,7 @@ def depth_levels(depth: Array, width_mm: float | None) -> tuple[Array, float]:
 
 
 def overlay(frame: Array, measured: Fields, row: int = 0, *, text: bool = True) -> Array:
-    """Return a picture u8 (h, w, 3) of a frame with what was measured.
+    """Return an image u8 (h, w, 3) of a frame with what was measured.
 
     Depth is in colour, the rim of contact is white, arrows are shear that is longer than its
     deviation, and force and depth are written as `text`.
@@ -45,7 +46,7 @@ def overlay(frame: Array, measured: Fields, row: int = 0, *, text: bool = True) 
     colours = cv2.cvtColor(cv2.applyColorMap(level, cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB)
     weight = np.minimum(level, 64) * (_OPAQUE / 64)
     view = cv2.blendLinear(np.ascontiguousarray(frame), colours, 1 - weight, weight)
-    inside = (one.contact[0] > 0.5).astype(np.uint8)
+    inside = without_islands((one.contact[0] > 0.5).astype(np.uint8))
     rims = cv2.findContours(inside, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
     cv2.drawContours(view, rims, -1, _WHITE, 1, cv2.LINE_AA)
     _draw_shear(view, one, inside)

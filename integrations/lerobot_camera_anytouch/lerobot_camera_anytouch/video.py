@@ -1,6 +1,6 @@
-"""A film in the place of LeRobot's OpenCV camera.
+"""A video in the place of LeRobot's OpenCV camera.
 
-LeRobot's own reads a film as fast as it can, and ends with it.
+LeRobot's own reads a video as fast as it can, and ends with it.
 """
 
 from __future__ import annotations
@@ -11,43 +11,43 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from anytouch_jax.live.cameras import LoopedFilm
+from anytouch_jax.live.cameras import LoopedVideo
 
 
-class FilmCamera:
-    """A film at its frame rate, again and again, with the methods of a camera of LeRobot.
+class VideoCamera:
+    """A video at its frame rate, again and again, with the methods of a camera of LeRobot.
 
-    Pictures are RGB.
+    Images are RGB.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._at = 0.0
-        self._film: LoopedFilm | None = None
+        self._video: LoopedVideo | None = None
         self._latest: np.ndarray | None = None
         self.width = self.height = self.fps = 0
 
     @property
     def is_connected(self) -> bool:
-        return self._film is not None
+        return self._video is not None
 
     def connect(self, warmup: bool = True) -> None:
-        self._film = LoopedFilm(self._path)
-        self.fps = round(self._film.get(cv2.CAP_PROP_FPS)) or 30
+        self._video = LoopedVideo(self._path)
+        self.fps = round(self._video.get(cv2.CAP_PROP_FPS)) or 30
         self.height, self.width = self.read().shape[:2]
 
     def disconnect(self) -> None:
-        if self._film is not None:
-            self._film.release()
-        self._film = self._latest = None
+        if self._video is not None:
+            self._video.release()
+        self._video = self._latest = None
 
     def read(self, *settings: object) -> np.ndarray:
-        if self._film is None:
-            raise ConnectionError(f"the film {self._path} is not connected")
-        whole, picture = self._film.retrieve() if self._film.grab() else (False, None)
-        if not whole or picture is None:
-            raise RuntimeError(f"the film {self._path} cannot be read")
-        self._latest = np.ascontiguousarray(picture[..., ::-1])
+        if self._video is None:
+            raise ConnectionError(f"the video {self._path} is not connected")
+        whole, image = self._video.retrieve() if self._video.grab() else (False, None)
+        if not whole or image is None:
+            raise RuntimeError(f"the video {self._path} cannot be read")
+        self._latest = np.ascontiguousarray(image[..., ::-1])
         self._at = time.perf_counter()
         return self._latest
 

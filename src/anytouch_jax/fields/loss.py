@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import jax
 import jax.numpy as jnp
 from jax import Array
 
 from anytouch_jax.batch import FieldBatch, FieldOutput
 from anytouch_jax.config import Config
-from anytouch_jax.fields.module import SlopeOutput
+from anytouch_jax.fields.module import FieldDecoder, SlopeOutput
 from anytouch_jax.fields.outputs import FORCE, LENGTH, STATES, STRESS, TORQUE
 from anytouch_jax.fields.poisson import differences
 from anytouch_jax.nn.functional import Net
@@ -36,7 +38,9 @@ def field_terms(params: Params, batch: FieldBatch, *, net: Net) -> tuple[Array, 
     batch = jax.tree.map(jnp.asarray, batch)
     network = net.bind(params)
     states = network.touch.states(batch.clip, batch.sensor, STATES)
-    return output_terms(*network.fields.with_slope(states, batch.clip, batch.aspect), batch)
+    decoder = cast(FieldDecoder, network.fields)
+    out, slope = decoder.with_slope(states, batch.clip, batch.aspect)
+    return output_terms(out, slope, batch)
 
 
 def output_terms(out: FieldOutput, slope: SlopeOutput, batch: FieldBatch) -> tuple[Array, Metrics]:

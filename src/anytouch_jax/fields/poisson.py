@@ -59,8 +59,8 @@ def integrate(gradient: Array) -> Array:
     and the last row along y is ignored.
     """
     rows, columns = gradient.shape[1:3]
-    down, down_divergence, _ = transforms(rows)
-    across, across_divergence, _ = transforms(columns)
+    down, down_divergence, _ = map(jnp.asarray, transforms(rows))
+    across, across_divergence, _ = map(jnp.asarray, transforms(columns))
     spectrum = down @ gradient[..., 0] @ across_divergence.T
     spectrum = spectrum + down_divergence @ gradient[..., 1] @ across.T
     spectrum = spectrum * jnp.asarray(inverse_spectrum(rows, columns))[None]

@@ -153,7 +153,7 @@ figures: $(STAMP) ## after new weights: measure the shipped encoder, then the re
 	$(PY) -m experiments.encoders.picture docs/pictures/first_touch.png
 	$(PY) -m experiments.encoders.animation docs/pictures/press.webp
 	$(PY) -m experiments.pages
-	$(PY) -m experiments.notebooks.execute 01 02 03 04
+	$(PY) -m experiments.notebooks.execute 01 02 03
 	WRITE_PAGES=1 $(PY) -m pytest tests/laws/test_pages_run.py
 
 release-check: $(STAMP) ## build a release, install it into an empty environment, run the README there (network)

@@ -36,8 +36,7 @@ class Findings(NamedTuple):
     nothing: Course
     pixels: np.ndarray  # (n,) numbers of NAMES that a head on raw pixels gives
     commonest: int  # the shape with most touches of train
-    depth: np.ndarray  # (m, h, w) mm, as the encoder of the package measures the first touches
-    force: np.ndarray  # (m,) N
+    force: np.ndarray  # (m,) N, as the encoder of the package measures the first touches
     usual_force: float  # N, the median of train
     trained_on: int  # touches
 
@@ -119,8 +118,9 @@ def sentences(found: Findings) -> list[str]:
     worst = min(rights, key=lambda name: rights[name].value)
     head = found.package.points[0].named
     not_learned = (
-        f"Not learned: of the {len(rights)} shapes it knows the {worst} least, {rights[worst]}, "
-        f"where chance is {100 / len(NAMES):.0f} %. Most of what it knows came with the package: "
+        f"Not learned: of the {len(rights)} shapes in the test it knows the {worst} least, "
+        f"{rights[worst]}, where chance is {100 / len(NAMES):.0f} %. Most of what it knows came "
+        "with the package: "
         f"{HEAD}, names {scores[HEAD]}, and training the whole encoder adds "
         f"{gain_of(end, head, test)}."
     )
@@ -220,8 +220,9 @@ def _presses_section(found: Findings, folder: Path) -> Section:
     """Return presses with the names that they were given."""
     path = folder / "presses.png"
     test = found.test
-    # One press of each shape first, the deepest, so that none is left out.
-    order = np.argsort(-test.depth, kind="stable")
+    # One press of each shape: the one that changes the image most, since some hardly show.
+    change = np.abs(test.frame.astype(np.float32) - test.background).mean((1, 2, 3))
+    order = np.argsort(-change, kind="stable")
     chosen = [order[test.shape[order] == number][:1] for number in range(len(NAMES))]
     rows = np.concatenate(chosen)[:SHOWN]
     named = _named(found)
@@ -246,10 +247,10 @@ def _presses_section(found: Findings, folder: Path) -> Section:
             )
     write_figure(path, figure)
     text = (
-        f"The deepest held-out press of each shape, and below it the name by {PACKAGE} and then by "
-        f"{NOTHING}. Wrong names are grey and slanted."
+        "The clearest held-out press of each shape, and below it the name by "
+        f"{PACKAGE} and then by {NOTHING}. Wrong names are grey and slanted."
     )
-    return Section("Eight presses", text, figure=path)
+    return Section("Presses and their names", text, figure=path)
 
 
 def _force_sections(found: Findings, folder: Path) -> list[Section]:
@@ -261,8 +262,8 @@ def _force_sections(found: Findings, folder: Path) -> list[Section]:
     if low is None or low <= 0:
         return []
     path = folder / "force.png"
-    figure, axes = panels(1, 2, 4.2, 3.6)
-    axis, beside = axes[0]
+    figure, axes = panels(1, 1, 6.0, 3.6)
+    axis = axes[0][0]
     most = float(np.percentile(test.force, 99))
     axis.plot([0, most], [0, most], color=GREY, lw=1)
     axis.axhline(found.usual_force, color=GREY, ls="--", lw=1)
@@ -278,10 +279,6 @@ def _force_sections(found: Findings, folder: Path) -> list[Section]:
     axis.scatter(test.force, found.force, s=9, color=COLOURS[PACKAGE], lw=0, alpha=0.7)
     axis.set(xlim=(0, most), ylim=(0, most), xlabel="true force, N", ylabel="measured, N")
     _bare(axis)
-    row = int(np.argsort(-test.depth)[len(test.depth) // 20])
-    shown = beside.imshow(found.depth[row], cmap="viridis", vmin=0)
-    beside.set(xticks=[], yticks=[], title=f"depth of a {NAMES[test.shape[row]]}, mm")
-    figure.colorbar(shown, ax=beside, shrink=0.8)
     write_figure(path, figure)
     text = (
         f"Force is off by {off.mean():.2f} N in the mean, and {guess.mean():.2f} N by always "
@@ -289,7 +286,7 @@ def _force_sections(found: Findings, folder: Path) -> list[Section]:
         f"[{low:.2f}, {high:.2f}]. No touch of this sensor was used for that: the package "
         "measures as it is, given the width of the gel."
     )
-    return [Section("Depth and force, without any training", text, figure=path)]
+    return [Section("Force, without any training", text, figure=path)]
 
 
 def _draw_examples(path: Path) -> None:

@@ -54,17 +54,15 @@ def pixel_names(learner: Learner, train: Touches, test: Touches) -> np.ndarray:
     return np.asarray((x[count:] @ head.weights + head.bias).argmax(1))
 
 
-def measured(encoder: Encoder, sensor: Path, test: Touches) -> tuple[np.ndarray, np.ndarray]:
-    """Return depth (m, h, w) in mm and force (m,) in N of the first MEASURED test touches."""
-    depth = []
+def measured_force(encoder: Encoder, sensor: Path, test: Touches) -> np.ndarray:
+    """Return the force (m,) in N of the first MEASURED test touches."""
     force = []
     pairs = list(zip(test.frame, test.background, strict=True))[:MEASURED]
-    for frame, background in tracked(pairs, "depth"):
+    for frame, background in tracked(pairs, "force"):
         fields = encoder.measure(frame, background, str(sensor))
-        depth.append(fields.depth[0])
         assert fields.force is not None  # the sensor knows its width
         force.append(fields.force[0, 2])
-    return np.stack(depth), np.array(force)
+    return np.array(force)
 
 
 def main() -> None:
@@ -91,8 +89,8 @@ def main() -> None:
     settings = {"data.background": "subtract", "data.affine": (10.0, 0.05, 0.15)}
     learner = Learner(encoder.net, encoder.config.with_settings(settings))
     pixels = pixel_names(learner, train, test)
-    depth, force = measured(encoder, sensor, test)
-    say("depth and force are measured")
+    force = measured_force(encoder, sensor, test)
+    say("force is measured")
     course = partial(train_course, learner, data=(train, test), log=say)
     say(f"training {PACKAGE}")
     params = with_head(learner, encoder.params["touch"], train)
@@ -106,7 +104,6 @@ def main() -> None:
         nothing,
         pixels,
         int(np.bincount(train.shape).argmax()),
-        depth,
         force,
         float(np.median(train.force)),
         len(train.shape),

@@ -154,13 +154,14 @@ def train_course(
     held = shown(learner, test)
     score = jax.jit(learner.logits)
 
+    # All that differs between two trainings is an argument, so the second compiles nothing.
     @jax.jit
-    def step(state: Params, moments: Any, batch: Any, key: Any, factor: Any) -> Any:
+    def step(state: Params, moments: Any, fixed: Params, batch: Any, key: Any, rates: Any) -> Any:
         loss, slope = jax.value_and_grad(learner.loss)(state, fixed, batch, key)
         change, moments = tx.update(slope, moments, state)
         change = {
-            "touch": jax.tree.map(lambda one: -rate * factor * one, change["touch"]),
-            "head": jax.tree.map(lambda one: -HEAD_RATE * factor * one, change["head"]),
+            part: jax.tree.map(lambda one, by=rates[part]: -by * one, change[part])
+            for part in ("touch", "head")
         }
         return optax.apply_updates(state, change), moments, loss
 
@@ -180,8 +181,9 @@ def train_course(
         batch = (train.frame[rows], train.background[rows], train.shape[rows])
         begun = time.monotonic()
         key = jax.random.fold_in(jax.random.key(1), number)
-        factor = np.float32(_factor(number, steps))
-        state, moments, loss = step(state, moments, batch, key, factor)
+        factor = _factor(number, steps)
+        rates = {"touch": np.float32(rate * factor), "head": np.float32(HEAD_RATE * factor)}
+        state, moments, loss = step(state, moments, fixed, batch, key, rates)
         jax.block_until_ready(loss)
         number += 1
         if number > 1:  # the first one was compiled

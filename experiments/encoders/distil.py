@@ -12,9 +12,12 @@ means over the image. It learns on wide images, so that it gives the same on sen
 met: photographs and cliparts beside real, simulated and drawn touches, moved, zoomed, tinted, grey,
 less their own blur as a background is subtracted, or as a relief under coloured lights.
 
-1. Apart, on crops: each block sees what the teacher's block before it gives.
-2. Together, on crops: each block sees what the student's block before it gives.
-3. Together, on whole images, batch norms held.
+1. Apart, on crops: each block sees what the teacher's block before it gives. Batch norms help.
+2. Together, on crops: each block sees what the student's block before it gives. Batch norms are
+   folded into the convolutions first, because a few mixed images have no fixed mean.
+3. Together, on whole images, and more for the means.
+
+`--start` goes on with parts 2 and 3 from a trunk.
 
 `python -m experiments.encoders.trunk touches` writes the touches. This file needs no other of the
 project, because PyTorch and JAX are hardly ever in one environment.
@@ -23,9 +26,10 @@ project, because PyTorch and JAX are hardly ever in one environment.
 from __future__ import annotations
 
 import argparse
+import copy
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -61,7 +65,6 @@ STORED = 160  # pixels of the side of an image that crops are taken from
 CROPS = 60  # of a photograph
 TOUCHES = 0.5  # share of a batch
 FLATTEST = 0.1  # part of the usual variance, below which images do not count more
-OF_MEANS = 0.3  # weight of the error of means beside that of maps
 
 
 # Networks -----------------------------------------------------------------------------------------
@@ -108,24 +111,38 @@ class Layer(nn.Module):
     ) -> None:
         super().__init__()
         self.convolution: Any = nn.Conv2d(inputs, outputs, side, stride, groups=groups, bias=False)
-        self.norm = nn.BatchNorm2d(outputs, eps=EPSILON, momentum=0.03)
+        self.norm: nn.BatchNorm2d | None = nn.BatchNorm2d(outputs, eps=EPSILON, momentum=0.03)
         self.register_buffer("scale", torch.ones(outputs))
         self.register_buffer("shift", torch.zeros(outputs))
         self.side = side
         self.stride = stride
+        self.groups = groups
         self.act = act
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        x = self.norm(self.convolution(padded(x, self.side, self.stride)))
-        x = x * self.scale[:, None, None] + self.shift[:, None, None]
+        x = self.convolution(padded(x, self.side, self.stride))
+        if self.norm is not None:
+            x = self.norm(x) * self.scale[:, None, None] + self.shift[:, None, None]
         return functional.relu6(x) if self.act else x
 
-    def folded(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the kernel and the bias of the layer as one convolution."""
+    def fold(self) -> None:
+        """Fold the norm, the scale and the shift into the convolution."""
+        if self.norm is None:
+            return
         gain = self.norm.weight / torch.sqrt(self.norm.running_var + EPSILON)
-        bias = (self.norm.bias - self.norm.running_mean * gain) * self.scale + self.shift
         kernel = self.convolution.weight * (gain * self.scale)[:, None, None, None]
-        return kernel.detach(), bias.detach()
+        bias = (self.norm.bias - self.norm.running_mean * gain) * self.scale + self.shift
+        self.set(kernel.detach(), bias.detach())
+
+    def set(self, kernel: torch.Tensor, bias: torch.Tensor) -> None:
+        """Make this a plain convolution."""
+        plain = nn.Conv2d(
+            kernel.shape[1] * self.groups, len(kernel), self.side, self.stride, groups=self.groups
+        )
+        plain.weight.data = kernel.contiguous(memory_format=torch.channels_last)
+        plain.bias.data = bias
+        self.convolution = plain
+        self.norm = None
 
 
 class Block(nn.Module):
@@ -170,6 +187,20 @@ class Trunk(nn.Module):
         blocks = zip(self.blocks, before, strict=False)
         return [self.stem(x), *(block(given) for block, given in blocks)]
 
+    def fold(self) -> None:
+        """Fold all batch norms into the convolutions."""
+        for layer in self.layers().values():
+            layer.fold()
+
+    def layers(self) -> dict[str, Layer]:
+        """Return all layers by their names in `nn.sight.Sight`."""
+        layers = {"stem": self.stem}
+        for number, block in enumerate(self.blocks):
+            for part in ("wide", "depth", "narrow"):
+                if getattr(block, part) is not None:
+                    layers[f"block{number}/{part}"] = getattr(block, part)
+        return layers
+
     def outputs(self) -> list[Layer]:
         """Return the layers that give the outputs of the stem and of each block."""
         return [self.stem, *(block.narrow for block in self.blocks)]
@@ -193,6 +224,7 @@ def read_teacher(path: Path) -> Trunk:
         for part in ("weight", "bias", "running_mean", "running_var"):
             state[f"{name}.norm.{part}"] = weights[f"{norm}.{part}"]
     trunk.load_state_dict(state)
+    trunk.fold()
     for value in trunk.parameters():
         value.requires_grad_(False)
     return trunk.eval().to(memory_format=torch.channels_last)
@@ -205,20 +237,27 @@ def levels(images: Images) -> torch.Tensor:
 
 
 def exported(trunk: Trunk) -> dict[str, np.ndarray]:
-    """Return the parameters of `nn.sight.Sight`, without its "read"."""
-    layers = {"stem": trunk.stem}
-    for number, block in enumerate(trunk.blocks):
-        for part in ("wide", "depth", "narrow"):
-            if getattr(block, part) is not None:
-                layers[f"block{number}/{part}"] = getattr(block, part)
+    """Return the parameters of the trunk of `nn.sight.Sight`."""
+    folded = copy.deepcopy(trunk)
+    folded.fold()
     params = {}
-    for name, layer in layers.items():
-        kernel, bias = layer.folded()
+    for name, layer in folded.layers().items():
+        kernel = layer.convolution.weight.detach()
         # Rows, columns and inputs first, outputs last. A depthwise kernel has one input a channel.
-        matrix = kernel.permute(2, 3, 1, 0).reshape(-1, kernel.shape[0])
+        matrix = kernel.permute(2, 3, 1, 0).reshape(-1, len(kernel))
         params[f"{name}/kernel"] = matrix.numpy()
-        params[f"{name}/bias"] = bias.numpy()
+        params[f"{name}/bias"] = layer.convolution.bias.detach().numpy()
     return params
+
+
+def imported(params: Mapping[str, np.ndarray]) -> Trunk:
+    """Return the trunk of `exported` parameters, without batch norms."""
+    trunk = Trunk().to(memory_format=torch.channels_last)
+    for name, layer in trunk.layers().items():
+        matrix = torch.from_numpy(np.asarray(params[f"{name}/kernel"], np.float32))
+        kernel = matrix.reshape(layer.side, layer.side, -1, matrix.shape[1]).permute(3, 2, 0, 1)
+        layer.set(kernel, torch.from_numpy(np.asarray(params[f"{name}/bias"], np.float32)))
+    return trunk
 
 
 # Images -------------------------------------------------------------------------------------------
@@ -422,11 +461,15 @@ def errors(
 
 
 class Part(NamedTuple):
-    """How long a part is trained; its rate falls along a cosine to a fraction `lowest` of it."""
+    """How a part is trained; its rate falls along a cosine to a fraction `lowest` of it.
+
+    The rate is that of an array of deviation 1: arrays of folded norms differ much in size.
+    """
 
     minutes: float
     rate: float
     lowest: float
+    of_means: float = 0.3  # weight of the error of means beside that of maps
     apart: bool = False
 
 
@@ -439,7 +482,11 @@ def train(
     keep: Callable[[], None],
 ) -> None:
     """Train for a time, and `keep` the student every minute."""
-    adam = torch.optim.Adam(student.parameters(), lr=part.rate, betas=(0.9, 0.99))
+    sizes = [
+        max(float(array.detach().square().mean().sqrt()), 1e-3) for array in student.parameters()
+    ]
+    groups = [{"params": [array]} for array in student.parameters()]
+    adam = torch.optim.Adam(groups, betas=(0.9, 0.99))
     begun = time.monotonic()
     shown = 0
     average = None
@@ -453,14 +500,14 @@ def train(
             errors(one, other, spread, number, is_touch)
             for number, (one, other) in enumerate(zip(found, wanted, strict=True))
         ]
-        sum(of_maps + OF_MEANS * of_means for of_maps, of_means in parts).backward()
+        sum(of_maps + part.of_means * of_means for of_maps, of_means in parts).backward()
         cosine = part.lowest + (1 - part.lowest) * (1 + math.cos(math.pi * progress)) / 2
-        for group in adam.param_groups:
-            group["lr"] = part.rate * cosine * min(1.0, (step + 1) / 20)
+        for group, size in zip(adam.param_groups, sizes, strict=True):
+            group["lr"] = size * part.rate * cosine * min(1.0, (step + 1) / 20)
         adam.step()
         adam.zero_grad(set_to_none=True)
         step += 1
-        now = np.array([[float(value) for value in pair] for pair in parts])
+        now = np.array([[float(value.detach()) for value in pair] for pair in parts])
         average = now if average is None else average + 0.03 * (now - average)
         if (time.monotonic() - begun) // 60 >= shown:
             shown += 1
@@ -475,7 +522,8 @@ def main() -> None:
     parser.add_argument("teacher", type=Path, help="weights of EfficientNet-lite0 for PyTorch")
     parser.add_argument("--touches", type=Path, required=True, help="of `trunk touches`")
     parser.add_argument("--images", type=Path, nargs="+", required=True, help="folders of images")
-    parser.add_argument("--minutes", type=float, nargs=3, default=(15, 30, 20), help="of each part")
+    parser.add_argument("--minutes", type=float, nargs=3, default=(15, 25, 15), help="of each part")
+    parser.add_argument("--start", type=Path, help="a trunk to go on from, without part 1")
     parser.add_argument("--out", type=Path, default=Path("runs/trunk/trunk.npz"))
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
@@ -490,7 +538,6 @@ def main() -> None:
     teacher = read_teacher(options.teacher)
     crops = batches(touches, wide, 16, CROP, rng)
     spread = Spread(teacher, crops, 12)
-    student = first_student(spread, next(crops)[0])
     options.out.parent.mkdir(parents=True, exist_ok=True)
 
     def keep() -> None:
@@ -500,11 +547,17 @@ def main() -> None:
         part.replace(options.out)
 
     apart, together, whole = options.minutes
-    train(student, teacher, spread, crops, Part(apart, 8e-3, 0.15, apart=True), keep)
-    train(student, teacher, spread, crops, Part(together, 3e-3, 0.2), keep)
-    images = batches(touches, wide, 12, SIDE, rng)
-    spread = Spread(teacher, images, 16)
-    train(student.eval(), teacher, spread, images, Part(whole, 1.5e-3, 0.02), keep)
+    if options.start is None:
+        student = first_student(spread, next(crops)[0])
+        train(student, teacher, spread, crops, Part(apart, 0.05, 0.15, apart=True), keep)
+        student.fold()
+    else:
+        with np.load(options.start) as file:
+            student = imported(file)
+    train(student, teacher, spread, crops, Part(together, 0.015, 0.25), keep)
+    images = batches(touches, wide, 8, SIDE, rng)
+    spread = Spread(teacher, images, 24)
+    train(student, teacher, spread, images, Part(whole, 0.005, 0.03, of_means=1.0), keep)
     keep()
 
 

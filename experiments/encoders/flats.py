@@ -1,19 +1,17 @@
 """Are flat contacts read flat? Depth and force of single objects, most of them with flat tops.
 
     python -m experiments.encoders.flats anytouch-tiny
-    python -m experiments.encoders.flats anytouch-tiny --circles ../shared/real_touch3
 
 Eight height maps are pressed into new devices of the six camera sensors, with the turns, places and
 depths of training: a grid of studs of 4.8 mm, a punch of 6 mm, a ball of 6.35 mm, and a coin, a
 screw, one stud, a key and cloth. They are none of those that the decoder was trained on, though
 most families of `pressed` are like one of them. A row of `flats.jsonl` is an object. `filled` is
 the median depth over contact as a ratio of the true one, so a contact that is read as a ring has
-less than 1. `--circles` reads presses of a ball on another lab's GelSight, without a calibration.
+less than 1.
 """
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import json
 import math
@@ -30,8 +28,6 @@ import numpy.typing as npt
 from tyro.conf import Positional
 
 from anytouch_jax.config import SimulatedConfig
-from anytouch_jax.data.images import decode
-from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.fields.loss import TOUCHED
 from anytouch_jax.nn.functional import build
 from anytouch_jax.objectives import normalise_touch
@@ -50,7 +46,6 @@ Array = npt.NDArray[Any]
 BATCHES = 36  # of SIZE touches
 SIZE = 32
 LEAST = 0.1  # mm of a press that is scored
-_COLUMNS = ("centre_x_px", "centre_y_px", "contact_radius_px")
 
 
 @dataclass(frozen=True)
@@ -58,7 +53,6 @@ class FlatOptions:
     """Measure depth and force of objects with flat tops."""
 
     model: Positional[str]  # Encoder that measures.
-    circles: Path | None = None  # Folder of presses with labelled circles, instead.
     picture: Path | None = None  # PNG of true depth above what was read.
     out: Path = Path("experiments/results/flats.jsonl")  # JSON lines.
 
@@ -214,57 +208,10 @@ def _draw(path: Path, names: tuple[str, ...], shown: dict[tuple[str, str], Any])
     cv2.imwrite(str(path), np.uint8(np.clip(40 + 200 * np.vstack(rows), 0, 255)))
 
 
-def circles(model: str, folder: Path) -> dict[str, dict[str, float]]:
-    """Return errors against circles that were drawn by hand, of a GelSight without calibration."""
-    encoder = load_encoder(model)
-    rows = list(csv.DictReader((folder / "balls.csv").open()))
-    gel = decode(next(folder.glob("fots-gelsight/*back*")))
-    found: dict[str, dict[str, float]] = {}
-    for sensor in ("gelsight_mini", "unknown"):
-        values: dict[str, list[float]] = {}
-        for row in rows:
-            frame = decode(folder / row["path"])
-            measured = encoder.measure(frame, gel, sensor, width_mm=12.26, log=lambda _: None)
-            for title, value in _against(measured, frame, row).items():
-                values.setdefault(title, []).append(value)
-        name = f"another lab's GelSight, read as {sensor}"
-        found[name] = {title: float(np.nanmedian(v)) for title, v in values.items()}
-        found[name]["touches"] = float(len(rows))
-    return found
-
-
-def _against(measured: Any, frame: Array, row: dict[str, str]) -> dict[str, float]:
-    """Return the errors of one press against its circle."""
-    mm = 1 / 19.58
-    x, y, radius = (float(row[name]) * mm for name in _COLUMNS)
-    height, width = frame.shape[:2]
-    depth = cv2.resize(measured.depth[0], (width, height), interpolation=cv2.INTER_LINEAR)
-    contact = cv2.resize(measured.contact[0], (width, height)) > 0.5
-    rows, columns = np.mgrid[:height, :width] * mm
-    own = math.sqrt(contact.sum() * mm**2 / math.pi)
-    middle = (width * mm / 2, height * mm / 2)
-    centre = math.hypot(*(measured.centre[0] + middle - (x, y)))
-    ring = np.abs(np.hypot(columns - x, rows - y) - radius) < 2 * mm
-    ball_radius = 2.35
-    cap = ball_radius - math.sqrt(max(ball_radius**2 - radius**2, 0))
-    rim = float(np.median(depth[ring]))
-    return {
-        "centre_mm": centre,
-        "radius_ratio": own / radius,
-        "deepest_mm": float(depth.max()),
-        "above_rim_mm": float(depth.max()) - rim,
-        "cap_mm": cap,
-        "above_rim_ratio": (float(depth.max()) - rim) / max(cap, 1e-3),
-    }
-
-
 def run(options: FlatOptions) -> int:
     """Print and store the errors."""
     enable_compilation_cache()
-    if options.circles is not None:
-        found = circles(options.model, options.circles)
-    else:
-        found = scores(locate(options.model), options.picture)
+    found = scores(locate(options.model), options.picture)
     about = {"machine": dataclasses.asdict(machine.describe())}
     for name, values in found.items():
         write_record(options.out, name, about | values)

@@ -25,7 +25,7 @@ from anytouch_jax.objectives import normalise_touch, reconstruct
 from anytouch_jax.ops import tokens
 from anytouch_jax.sim import endless
 from anytouch_jax.sim.batches import SIMULATED, prepared
-from anytouch_jax.sim.endless import CAMERAS, Sampling
+from anytouch_jax.sim.endless import Sampling
 from anytouch_jax.sim.scene import training_scenes
 from anytouch_jax.train.mesh import enable_compilation_cache
 from anytouch_jax.train.progress import to_stderr as log
@@ -65,11 +65,24 @@ def configure(steps: int, masked: float, *, residual: bool) -> Config:
 def errors(params: Any, config: Config) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return errors (n,) of the next frame, those of a copy of the last one, and the objects."""
     net = build(config.model)
-    things = endless.objects_of(training_scenes(config.simulated), "test")
-    world = jax.device_put(endless.make_world(things, CAMERAS))
-    rows = np.array([config.model.sensor_row(name) for name in CAMERAS], np.int32)
-    frames = config.model.frames + 1
-    sampling = Sampling(frames=frames, size=config.model.image_size)
+    scenes = training_scenes(config.simulated)
+    held_out = endless.objects_of(scenes, "test")
+    # As many as in training, in turn, and drawn alike: so the simulator is not compiled again.
+    count = len(endless.objects_of(scenes, "train", variants=config.simulated.variants))
+    things = [held_out[number % len(held_out)] for number in range(count)]
+    sensors = config.simulated.sensors
+    made = endless.make_world(things, sensors, places=config.simulated.places)
+    world = jax.device_put(made)
+    rows = np.array([config.model.sensor_row(name) for name in sensors], np.int32)
+    sampling = Sampling(
+        frames=config.model.frames + 1,
+        takes=1,
+        size=config.model.image_size,
+        coarse=config.simulated.coarse,
+        depth=config.simulated.depth,
+        field_size=config.model.image_size // 2,
+    )
+    gallery = jnp.int32(0)  # for second takes, of which there are none
     sample = jax.jit(endless.sample_touches, static_argnames=("sampling", "count"))
 
     @jax.jit
@@ -84,12 +97,12 @@ def errors(params: Any, config: Config) -> tuple[np.ndarray, np.ndarray, np.ndar
     parts = []
     for number in range(TESTED):
         key = jax.random.fold_in(jax.random.key(77), number)
-        touches = sample(key, world, sampling=sampling, count=BATCH)
+        touches = sample(key, world, sampling=sampling, count=BATCH, gallery=gallery)
         clip = prepared(key, touches.clip[:, 0], touches.background[:, 0], config, jitter=False)
         noise = jax.random.uniform(key, (BATCH, config.model.patches))
         found = compared(clip, rows[np.asarray(touches.sensor[:, 0])], noise)
         touched = np.asarray(touches.labels["depth"][:, 0, -1]) > endless.LEAST_DEPTH
-        parts.append(np.stack([*found, np.asarray(touches.object)])[:, touched])
+        parts.append(np.stack([*found, np.asarray(touches.object) % len(held_out)])[:, touched])
     own, copied, objects = np.concatenate(parts, 1)
     return own, copied, objects
 
@@ -108,6 +121,7 @@ def scores(own: np.ndarray, copied: np.ndarray, objects: np.ndarray) -> dict[str
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--steps", type=int, default=200)
+    parser.add_argument("--stop-after", type=int, help="end after so many steps")
     parser.add_argument("--masked", type=float, default=0.75, help="fraction of the patches")
     parser.add_argument(
         "--whole", action="store_true", help="predict the whole frame, as the paper"
@@ -117,9 +131,9 @@ def main() -> None:
     options = parser.parse_args()
     enable_compilation_cache()
     config = configure(options.steps, options.masked, residual=not options.whole)
-    name = f"{'whole' if options.whole else 'residual'}, {options.masked:.0%} masked"
-    run = options.folder / name.replace(", ", "-").replace(" ", "-").replace("%", "")
-    result = pretrain(config, run, init="anytouch-tiny", log=log)
+    name = f"{'whole' if options.whole else 'residual'}, {100 * options.masked:.0f} % masked"
+    run = options.folder / name.replace(", ", "-").replace(" % ", "-").replace(" ", "-")
+    result = pretrain(config, run, init="anytouch-tiny", stop_after=options.stop_after, log=log)
     loaded = load_model(run)
     own, copied, objects = errors(loaded.params, config)
     moving = copied > np.median(copied)

@@ -147,14 +147,8 @@ def measure(folder: Path) -> Page:
         for name, one in flats.items()
         if "filled" in one
     ]
-    circles = [
-        (
-            name.removeprefix("another lab's GelSight, read as "),
-            *map(one.get, ("centre_mm", "radius_ratio", "above_rim_mm", "cap_mm")),
-        )
-        for name, one in flats.items()
-        if "cap_mm" in one
-    ]
+    devices, held = _devices(folder)
+    states = _states(folder)
     low, high = (bound(row[1] for row in rows) for bound in (min, max))
     studs = flats["studs"]
     findings = [
@@ -168,12 +162,41 @@ def measure(folder: Path) -> Page:
         ),
     ]
     answer = "On new simulated units the depth in contact is off by this much."
-    return Page(
-        "measure",
-        [real, circles, rows, objects, along],
-        findings,
-        (answer, f"{low:.2f} to {high:.2f} mm"),
-    )
+    tables = [real, devices, held, rows, objects, along, states]
+    return Page("measure", tables, findings, (answer, f"{low:.2f} to {high:.2f} mm"))
+
+
+def _devices(folder: Path) -> tuple[list[Any], list[Any]]:
+    """Return the rows of real circles, and those of intervals of force."""
+    circles = read_records(folder / "circles.jsonl")
+    rows = [
+        (
+            "GelSight of another lab",
+            "one device",
+            name,
+            *map(one.get, ("centre", "radius", "depth")),
+        )
+        for name, one in circles.items()
+    ]
+    cases = {
+        "calibrated": "calibrated by three presses of one object, others pressed",
+        "family": "of a known kind, not calibrated",
+        "unknown": "of an unknown kind, not calibrated",
+    }
+    held = [
+        (cases[name], "16 simulated devices", 100 * one["covered"], 100 * one["median_off"])
+        for name, one in read_records(folder / "intervals.jsonl").items()
+    ]
+    return rows, held
+
+
+def _states(folder: Path) -> list[Any]:
+    """Return the confusion matrix of the condition of a sensor, in percent of each state."""
+    rows: list[Any] = []
+    for record in read_records(folder / "states.jsonl").values():
+        for state, counts in zip(record["states"], record["counts"], strict=True):
+            rows.append((state, *(100 * count / sum(counts) for count in counts)))
+    return rows
 
 
 def lookalikes(folder: Path) -> Page:

@@ -56,7 +56,7 @@ def mujoco(folder: Path) -> Page:
         for found in one["shapes"].values()
     )
     findings.append(
-        f"Over {count} presses pictures differ from those of `simulate_touch` by {mean:.2f} grey "
+        f"Over {count} presses images differ from those of `simulate_touch` by {mean:.2f} grey "
         f"levels in the contact, and by {worst[2]:.2f} for the worst shape and sensor "
         f"({worst[1]}, {worst[0]})."
     )
@@ -66,11 +66,19 @@ def mujoco(folder: Path) -> Page:
     )
     if "speed" in records:
         tables.append(_speeds(records["speed"]))
-    answer = closed["align"] or closed["hold"]
-    first = ("Touch closes this part of the gap from blind to oracle in *Align*.", "")
-    if answer:
-        first = (first[0], f"{answer['touch'].shown('.0f')} %")
-    return Page("mujoco", tables, findings, first, figure=lambda path: _draw(tasks, path))
+    words = "Presses in MuJoCo and by `simulate_touch` differ by this much in the contact."
+    if closed["align"]:
+        words += f" In *Align* touch closes {closed['align']['touch'].mean:.0f} % of the gap."
+    seeds = {name: len(_seeds(tasks, name, "oracle")) for name in COSTS}
+    about = "; ".join(f"*{name.capitalize()}* has {count}" for name, count in seeds.items())
+    return Page(
+        "mujoco",
+        tables,
+        findings,
+        (words, f"{mean:.2f} grey levels"),
+        figure=lambda path: _draw(tasks, path),
+        words={"seeds": about},
+    )
 
 
 def _seeds(tasks: dict[str, Record], name: str, kind: str) -> list[Record]:
@@ -107,7 +115,7 @@ def _speeds(record: Record) -> Table:
     words = {
         "step_112": "a step and its reading, 112 pixels",
         "step_224": "a step and its reading, 224 pixels",
-        "batch_112": "contact and picture in a batch of 32, two threads, 112 pixels",
+        "batch_112": "contact and image in a batch of 32, two threads, 112 pixels",
         "untouched_112": "an untouched pad, 112 pixels",
         "untouched_224": "an untouched pad, 224 pixels",
     }
@@ -137,8 +145,9 @@ def _draw(tasks: dict[str, Record], path: Path) -> None:
     """Draw the cost of each policy, a mark a seed."""
     from anytouch_jax.evaluate.plots import panels, write_figure
 
-    figure, (axes,) = panels(1, len(COSTS), 3.6, 2.6)
-    for axis, (name, title) in zip(axes, COSTS.items(), strict=True):
+    known = {name: title for name, title in COSTS.items() if _seeds(tasks, name, "oracle")}
+    figure, (axes,) = panels(1, max(len(known), 1), 3.6, 2.6)
+    for axis, (name, title) in zip(axes, known.items(), strict=False):
         for place, kind in enumerate(KINDS):
             costs = [float(np.mean(one["cost"])) for one in _seeds(tasks, name, kind)]
             axis.scatter([place] * len(costs), costs, s=18, color=f"C{place}")

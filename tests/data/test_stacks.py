@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from anytouch_jax.data.images import ImageError
+from anytouch_jax.data.images import ImageError, decode, image_files, list_images
 from anytouch_jax.data.stacks import read_stack, stacked_frames
 
 RNG = np.random.default_rng(0)
@@ -67,3 +67,23 @@ def test_damaged_and_unsafe_files_are_one_sentence(tmp_path):
     np.save(tmp_path / "wide.npy", np.float32([[[[9.0, 0, 0]]]]))
     with pytest.raises(ImageError, match=r"frame 0 of .*wide\.npy"):
         frames_of(tmp_path / "wide.npy")
+
+
+def test_a_folder_of_stacks_is_a_folder_of_their_frames(tmp_path):
+    np.savez(tmp_path / "touch_10.npz", frames=FRAMES[:3])
+    np.savez(tmp_path / "touch_2.npz", frames=FRAMES[3:], time=np.arange(9.0))
+    np.savez(tmp_path / "features.npz", features=np.zeros((3, 4)), rows=np.arange(3))
+    np.save(tmp_path / "background.npy", FRAMES[0])
+    files, named = list_images(tmp_path)
+    np.testing.assert_array_equal(np.stack([decode(file) for file in files[:9]]), FRAMES[3:])
+    np.testing.assert_array_equal(np.stack([decode(file) for file in files[9:]]), FRAMES[:3])
+    assert list(named) == ["background"]
+    assert image_files(tmp_path / "touch_10.npz") == files[9:]
+    np.savez(tmp_path / "two.npz", left=FRAMES, right=FRAMES)
+    with pytest.raises(ImageError, match=r"two\.npz has 2 arrays of frames: left, right"):
+        list_images(tmp_path)
+
+
+def test_channels_may_come_first(tmp_path):
+    np.save(tmp_path / "s.npy", np.moveaxis(FRAMES, -1, 1))
+    np.testing.assert_array_equal(np.stack(frames_of(tmp_path / "s.npy")), FRAMES)

@@ -112,7 +112,6 @@ def findings(right: dict[str, float], force_error: float) -> Findings:
         course(0.1, right[NOTHING]),
         named(0.2),
         0,
-        np.zeros((len(test.shape), 8, 8)),
         test.force + rng.normal(0, force_error, len(test.force)),
         float(np.median(test.force)),
         500,

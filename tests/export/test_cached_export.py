@@ -13,6 +13,7 @@ from measuring import measuring_weights
 from tiny_models import touch_model
 
 from anytouch_jax.config import to_json
+from anytouch_jax.encoder.base import FEW, Encoder
 from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.errors import CheckError, UserError
 from anytouch_jax.export import cache, engines
@@ -81,6 +82,29 @@ def test_every_engine_gives_the_features_of_xla_also_after_a_change_of_weights_w
         before = wanted
 
 
+def test_few_touches_are_computed_by_onnxruntime_and_many_by_xla(tmp_path, monkeypatch):
+    """A named engine computes all, as the user wants it."""
+    path = weights(tmp_path / "w.safetensors")
+    many = np.concatenate([CLIPS[:, 0]] * 2)
+    assert len(many) > FEW
+    wanted = load_encoder(path, engine="xla").encode_touch(many, "digit")
+    asked = []
+    exported = Encoder.exported
+    monkeypatch.setattr(
+        Encoder, "exported", lambda self, *a, **k: (asked.append(1), exported(self, *a, **k))[1]
+    )
+    for engine, count, uses in (
+        ("auto", FEW, 1),
+        ("auto", FEW + 1, 0),
+        ("onnxruntime", FEW + 1, 1),
+        ("xla", 1, 0),
+    ):
+        asked.clear()
+        found = load_encoder(path, engine=engine).encode_touch(many[:count], "digit")
+        assert len(asked) == uses, (engine, count)
+        np.testing.assert_allclose(found, wanted[:count], rtol=1e-4, atol=1e-5)
+
+
 def test_an_export_is_made_once_and_again_when_anything_that_decides_it_changes(
     tmp_path, monkeypatch
 ):
@@ -91,7 +115,7 @@ def test_an_export_is_made_once_and_again_when_anything_that_decides_it_changes(
     )
 
     def features(path):
-        return load_encoder(path).encode_touch(CLIPS[:, 0], "digit")
+        return load_encoder(path).encode_touch(CLIPS[:FEW, 0], "digit")
 
     path = weights(tmp_path / "run" / "w.safetensors")
     first = features(path)
@@ -123,12 +147,12 @@ def test_exports_of_the_package_and_of_a_folder_that_cannot_be_written_are_in_th
     assert cache._folders("anytouch-tiny") == cache._folders("hf://user/repo") == [own]
     path = weights(tmp_path / "w.safetensors")
     (tmp_path / ".engines").write_text("a file where the folder would be")
-    one, two = (load_encoder(path).encode_touch(CLIPS[:, 0], "digit") for _ in range(2))
+    one, two = (load_encoder(path).encode_touch(CLIPS[:FEW, 0], "digit") for _ in range(2))
     np.testing.assert_array_equal(one, two)
     assert [file.parent for file in stored(tmp_path)] == [own]
     # nothing can be written
     monkeypatch.setenv("XDG_CACHE_HOME", str(path))
-    np.testing.assert_array_equal(load_encoder(path).encode_touch(CLIPS[:, 0], "digit"), one)
+    np.testing.assert_array_equal(load_encoder(path).encode_touch(CLIPS[:FEW, 0], "digit"), one)
 
 
 def test_an_export_that_differs_is_never_used_and_not_tried_again(tmp_path, monkeypatch):
@@ -143,12 +167,12 @@ def test_an_export_that_differs_is_never_used_and_not_tried_again(tmp_path, monk
     path = weights(tmp_path / "w.safetensors")
     for _ in range(2):
         encoder = load_encoder(path)
-        live = load_encoder(path, engine="xla").encode_touch(CLIPS[:, 0], "digit")
-        np.testing.assert_array_equal(encoder.encode_touch(CLIPS[:, 0], "digit"), live)
+        live = load_encoder(path, engine="xla").encode_touch(CLIPS[:FEW, 0], "digit")
+        np.testing.assert_array_equal(encoder.encode_touch(CLIPS[:FEW, 0], "digit"), live)
         assert encoder.exported(1) is None
     assert len(tried) == 1 and stored(tmp_path) == []
     with pytest.raises(CheckError, match="differs from the live model"):
-        load_encoder(path, engine="onnxruntime").encode_touch(CLIPS[:, 0])
+        load_encoder(path, engine="onnxruntime").encode_touch(CLIPS[:FEW, 0])
 
 
 def test_xla_computes_what_an_export_cannot(tmp_path, monkeypatch):
@@ -158,7 +182,9 @@ def test_xla_computes_what_an_export_cannot(tmp_path, monkeypatch):
         np.testing.assert_array_equal(
             *(one.encode_touch(CLIPS, "digit", **given) for one in (auto, live))
         )
-    half = [one.computed_in("bfloat16").encode_touch(CLIPS[:, 0], "digit") for one in (auto, live)]
+    half = [
+        one.computed_in("bfloat16").encode_touch(CLIPS[:FEW, 0], "digit") for one in (auto, live)
+    ]
     np.testing.assert_array_equal(*half)
     gradient = jax.grad(
         lambda params: auto.traceable()(params, CLIPS[:1, :1], np.zeros(1, np.int32)).sum()
@@ -188,12 +214,12 @@ def test_fields_and_features_of_one_pass_are_those_of_xla(tmp_path):
 
 def test_an_encoder_in_another_process_finds_the_export(tmp_path):
     encoder = load_encoder(weights(tmp_path / "w.safetensors"))
-    wanted = encoder.encode_touch(CLIPS[:, 0], "digit")
+    wanted = encoder.encode_touch(CLIPS[:FEW, 0], "digit")
     copy = pickle.loads(pickle.dumps(encoder))
-    np.testing.assert_array_equal(copy.encode_touch(CLIPS[:, 0], "digit"), wanted)
+    np.testing.assert_array_equal(copy.encode_touch(CLIPS[:FEW, 0], "digit"), wanted)
     assert copy.exported(1) is not None and "exported" not in str(encoder.__getstate__().keys())
     moved = replace(encoder, params=jax.tree.map(lambda x: x * np.float32(1.1), encoder.params))
-    assert np.abs(moved.encode_touch(CLIPS[:, 0], "digit") - wanted).max() > 1e-3
+    assert np.abs(moved.encode_touch(CLIPS[:FEW, 0], "digit") - wanted).max() > 1e-3
 
 
 def test_an_engine_that_cannot_compute_says_so(tmp_path):
@@ -209,12 +235,12 @@ def test_an_engine_that_cannot_compute_says_so(tmp_path):
             lambda: (
                 load_encoder(path, engine="onnxruntime")
                 .computed_in("bfloat16")
-                .encode_touch(CLIPS[:, 0])
+                .encode_touch(CLIPS[:FEW, 0])
             ),
             "dtype",
         ),
     ):
         with pytest.raises(UserError, match=words):
             call()
-    load_encoder(path).encode_touch(CLIPS[:, 0])
+    load_encoder(path).encode_touch(CLIPS[:FEW, 0])
     assert json.loads(describes(stored(tmp_path)[0]).read_text())["form"] == "onnx"

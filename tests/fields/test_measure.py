@@ -6,6 +6,7 @@ import pytest
 from measuring import gel, measuring_weights
 
 import anytouch_jax as at
+from anytouch_jax.data.background.layout import known_backgrounds
 from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.fields import measure as fields
@@ -126,6 +127,33 @@ def test_without_contact_and_without_a_width_nothing_is_invented():
     assert (guessed.force_std >= 0.39 * np.abs(guessed.force)).all()
 
 
+def test_the_interval_of_force_is_of_factors_and_as_wide_as_what_is_known():
+    sure = output(force_log=np.full((1, 2), -50.0))
+    scales = [
+        fields.scale_of({}, "digit"),
+        fields.scale_of({}, "mine", 14.25),
+        fields.scale_of({}, "digit")._replace(case="calibrated", spread=0.2),
+    ]
+    ratios = []
+    for scale in scales:
+        one = fields.fields_of(sure, scale, shape=4 / 3)
+        about = one.summary()
+        assert about["force_low"] < about["force_z"] < about["force_high"]
+        ratios.append(
+            [about["force_high"] / about["force_z"], about["force_z"] / about["force_low"]]
+        )
+    family, unknown, calibrated = np.log(ratios)
+    assert (unknown > 1.5 * family).all() and (calibrated < family + 0.1).all()
+    # Forces of unknown devices are read too small, so their interval reaches further up.
+    assert unknown[0] > 1.2 * unknown[1]
+    np.testing.assert_allclose(calibrated, fields.Z * 0.2, rtol=0.15)
+    # The network's own deviation comes on top, and a fault says that nothing is known.
+    wide = fields.fields_of(output(), scales[0], shape=4 / 3)
+    faulty = fields.fields_of(sure, scales[0], shape=4 / 3, faults=("grey",))
+    assert wide.force_high > one.force_high and faulty.force_low == 0
+    assert fields.fields_of(sure, fields.scale_of({}, "mine"), shape=1.0).force_low is None
+
+
 def test_frames_of_every_form_are_measured_alike(encoder):
     frames = np.stack([gel(), gel()[::-1], gel()[:, ::-1]])
     several = encoder.measure(frames, None, "tacto", width_mm=10.0)
@@ -190,7 +218,7 @@ def test_what_cannot_be_measured_is_one_sentence(encoder, tiny_run):
 def faulty(kind: str) -> tuple[np.ndarray, np.ndarray | None]:
     """Return a frame of a real look of the GelSight Mini with a fault, and its background."""
     real = np.ascontiguousarray(
-        np.repeat(np.repeat(fields.known_backgrounds("gelsight_mini")[0], 4, 0), 4, 1)
+        np.repeat(np.repeat(known_backgrounds("gelsight_mini")[0], 4, 0), 4, 1)
     )
     grey = np.repeat(real.mean(2, keepdims=True).astype(np.uint8), 3, 2)
     return {

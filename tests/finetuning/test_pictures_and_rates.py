@@ -56,7 +56,7 @@ def test_rates_fall_from_the_features_down():
     recipe = Recipe(rate=1.0, head_rate=5.0, depth_decay=0.5)
 
     def rate(name, shape=(1,)):
-        return rates.rate_of(name, shape, recipe, model, {})
+        return rates.depth_factor(name, shape, recipe, model, {})
 
     assert rate("head/kernel") == 5.0
     assert rate("touch/projection/kernel") == rate("touch/post_norm/scale") == 1.0
@@ -66,12 +66,16 @@ def test_rates_fall_from_the_features_down():
 
 
 def test_another_trunk_has_rates_by_the_numbers_of_its_blocks():
-    names = ["touch/sight/block0/kernel", "touch/sight/block3/kernel", "touch/projection/kernel"]
+    model = touch_model(sight=4)
+    names = [name for name in flatten(build(model).abstract()) if name.startswith("touch/")]
     depths = rates.trunk_depths(names)
-    assert depths == {"touch/sight/block": 4}
+    assert depths == {"touch/sight/trunk/block": 11}
     recipe = Recipe(depth_decay=0.5)
-    found = [rates.rate_of(name, (1,), recipe, touch_model(), depths) for name in names]
-    assert found == [0.125, 1.0, 1.0]
+    found = {name: rates.depth_factor(name, (1,), recipe, model, depths) for name in names}
+    assert found["touch/sight/trunk/block10/narrow/kernel"] == 1.0
+    assert found["touch/sight/trunk/block8/depth/bias"] == 0.25
+    assert found["touch/sight/trunk/stem/kernel"] == 0.5**11
+    assert found["touch/sight/read/kernel"] == found["touch/projection/kernel"] == 1.0
 
 
 @pytest.mark.parametrize(("mean", "wanted"), [(0.0, 1.0), (3.0, 10**-0.5)])

@@ -36,7 +36,7 @@ from anytouch_jax.live import stream as streams
 from anytouch_jax.live.stream import Mailbox
 from anytouch_jax.sim import dataset
 from anytouch_jax.sim.sensing.sensors import SENSORS, bases
-from tests.datasets.readers import test_bags, test_corpora, test_lerobot
+from tests.datasets.readers import test_bags, test_containers, test_corpora, test_lerobot
 from tests.evaluate.test_probing import MAKERS, paint
 from tests.laws.test_readme import PAGES
 
@@ -88,6 +88,14 @@ STAGE2 = (
 
 def small(words: list[str]) -> list[str]:
     """Return the words of a command, with sizes that compile fast if it trains."""
+    if words[0] == "finetune":
+        # Time for the linear head and a few steps.
+        return [
+            *words[: words.index("--minutes")],
+            "--minutes",
+            "0.3",
+            *words[words.index("--minutes") + 2 :],
+        ]
     if words[0] != "train" or "runs/try" in words:  # that one is typed word for word
         return words
     stage = STAGE2 if words[words.index("--stage") + 1] == "2" else STAGE1
@@ -294,6 +302,8 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
         Path("labels.csv").write_text("object,material,hardness\nmug,ceramic,9\nsponge,foam,2\n")
         Path("notes.md").write_text("Trained on made touches.\n")
         test_lerobot.make(Path("my_data_set"))
+        test_containers.make_robomimic(Path("demo.hdf5"))
+        test_containers.make_replay(Path("replay.zarr"))
         Path("recordings").mkdir()
         test_bags.write_ros(Path("recordings"), 2)
         fill_ycb(Path("home/data/YCB-Slide"))

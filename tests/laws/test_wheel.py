@@ -76,6 +76,6 @@ def test_the_wheel_works_in_an_empty_folder(tmp_path):
     )
     assert (
         ran(python, "-c", f"import anytouch_jax as at; print({shape})", cwd=empty).strip()
-        == "(1, 192)"
+        == "(1, 448)"
     )
     assert not list(empty.iterdir())

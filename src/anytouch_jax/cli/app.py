@@ -66,7 +66,7 @@ class Command(NamedTuple):
 
 GROUPS = {
     "data": "Prepare a manifest of tactile frames.",
-    "sensor": "Simulate your own sensor.",
+    "sensor": "Fit, calibrate and check your own sensor.",
     "probe": "Probe frozen features with simple heads.",
 }
 COMMANDS = {
@@ -138,7 +138,7 @@ COMMANDS = {
         "Probe a public benchmark with the authors' settings.",
     ),
     "finetune": Command(
-        "finetune:FinetuneOptions",
+        "finetune:TuningOptions",
         "finetune:run",
         "Train the encoder and a head on your labels, in minutes.",
     ),
@@ -151,6 +151,16 @@ COMMANDS = {
         "sensor:FitOptions",
         "sensor:run_fit",
         "Fit the look of your sensor to 5 to 50 images of it, for the simulator.",
+    ),
+    "sensor calibrate": Command(
+        "calibrate:CalibrateOptions",
+        "calibrate:run",
+        "Set the depth of your device by presses of a ball, and its force by a known weight.",
+    ),
+    "sensor check": Command(
+        "check:CheckOptions",
+        "check:run",
+        "Compare the untouched gel of today with the stored one: what has changed?",
     ),
     "report": Command(
         "retrieve:ReportOptions",

@@ -153,14 +153,15 @@ class DatasetOptions:
 
     Datasets: touch_and_go, visgel, cloth, objectfolder_real, tvl, ssvtp, ycb_slide, octopi,
     tacquad, feel, objectfolder, real_touch, taxim_presses, gelsight_mini_pretrain, fota,
-    tacbench_force, tacbench_pose, touchd_force, freetacman, webdataset, lerobot, bags, recordings.
-    Use recordings for your data: a folder of images for each recording, as
-    OBJECT/RECORDING/0.png. Put background.png, photo.jpg and caption.txt there or in a folder
-    above.
+    tacbench_force, tacbench_pose, touchd_force, freetacman, webdataset, lerobot, bags, hdf5, zarr,
+    recordings. Use recordings for your data: a folder of images or a stack of frames (.npy,
+    .npz) for each recording, as OBJECT/RECORDING/0.png. Put background.png, photo.jpg and
+    caption.txt there or in a folder above. For hdf5 and zarr, `anytouch info FILE` lists the keys.
     """
 
     name: Positional[str]  # Name of the dataset.
-    root: Positional[Path]  # Folder that holds the unpacked dataset.
+    # Folder that holds the unpacked dataset. hdf5, zarr: or one file.
+    root: Positional[Path]
     # Manifest to write, .parquet or .csv, in ROOT or above it (default: ROOT/NAME.parquet).
     out: Path | None = None
     # Keep your edits of the manifest OUT: columns, splits, texts and labels, matched by path.
@@ -176,9 +177,7 @@ class DatasetOptions:
     # Let the reader write images into ROOT, for a dataset of arrays or videos.
     export: bool = False
     sensor: str | None = None
-    """recordings, webdataset, lerobot, bags: the sensor, by its name in the configuration or a new
-    name.
-    """
+    """recordings, webdataset, lerobot, bags, hdf5, zarr: the sensor, by its name or a new name."""
     split_by: str | None = None
     """recordings: what is held out: object, recording (a single image is one), a column of the
     labels, or the part of the path in the parentheses of a pattern, as '(p[0-9]+)_'. Default:
@@ -197,11 +196,11 @@ class DatasetOptions:
     url: str | None = None
     keys: tuple[str, ...] = ()
     """lerobot, freetacman: tactile cameras. bags: topics of tactile images. webdataset: fields, as
-    left.jpg.
+    left.jpg. hdf5, zarr: arrays of tactile images, as obs/tactile.
     """
     values: tuple[str, ...] = ()
-    """lerobot: features that become labels. bags: labels from other topics, as
-    force_z=/ft:wrench.force.z.
+    """lerobot, hdf5, zarr: features or arrays that become labels. bags: labels from other topics,
+    as force_z=/ft:wrench.force.z.
     """
 
 

@@ -153,7 +153,7 @@ def _export_encoder(options: ExportOptions, out: Path) -> int:
 
 def _own_head(options: ExportOptions) -> Head | None:
     """Return the head of `anytouch finetune` that reads the exported features, None without one."""
-    from anytouch_jax.cli.inputs import head_in_use
+    from anytouch_jax.cli.heads import head_in_use
 
     def misfit(head: Head) -> str:
         wrong = []

@@ -19,7 +19,7 @@ Inner = Annotated[float, Range(0.001, 0.999, "between 0.001 and 0.999")]
 
 
 @dataclass(frozen=True, kw_only=True)
-class FinetuneOptions:
+class TuningOptions:
     """Train the encoder and a head on a label column, in minutes.
 
     Example: anytouch finetune --data mine.csv --label object --minutes 10 --out mine
@@ -58,14 +58,14 @@ class FinetuneOptions:
     seed: Seed = 0  # Random seed.
 
 
-def run(options: FinetuneOptions) -> int:
+def run(options: TuningOptions) -> int:
     """Fine-tune and write the folder."""
     from anytouch_jax.finetuning import FinetuneOptions as Settings
     from anytouch_jax.finetuning import finetune
-    from anytouch_jax.finetuning.folder import check_new
+    from anytouch_jax.finetuning.folder import refuse_filled
     from anytouch_jax.train.mesh import enable_compilation_cache
 
-    check_new(options.out)
+    refuse_filled(options.out)
     check_home(options.out)
     enable_compilation_cache()
     names = {field.name for field in fields(Settings)}
@@ -91,14 +91,17 @@ def _bar(seconds: float) -> Iterator[Callable[[State], None]]:
     from anytouch_jax.progress import bar
 
     is_terminal = sys.stderr.isatty()
+    logged = 0
     with bar(round(seconds), "reading touches") as advance:
 
         def show(state: State) -> None:
             words = f"held-out {state.score}, linear head {state.before}"
             if not state.score:
                 words = "linear head"
+            nonlocal logged
             advance(round(seconds - state.left), words)
-            if not is_terminal and state.score:
+            if not is_terminal and state.looks > logged:
+                logged = state.looks
                 log(f"{_clock(state.left)} left, {words}")
 
         yield show

@@ -146,6 +146,8 @@ def _lines(path: Path) -> list[str]:
     if not path.exists():
         raise UserError(f"there is no {path}. Name a file, a folder or an encoder.")
     suffix = path.suffix.lower()
+    if lines := _container(path):
+        return lines
     description = path.with_name(f"{path.name}.json")
     weights = None
     if path.is_dir() or (suffix in _WEIGHTS and suffix != ".npz" and not description.is_file()):
@@ -166,7 +168,7 @@ def _lines(path: Path) -> list[str]:
         return [f"{path}: an exported encoder", description.read_text("utf-8").strip()]
     if suffix in _TABLES:
         return _manifest(path)
-    if suffix == ".npz" and (lines := _arrays(path)):
+    if suffix == ".npz" and (lines := _arrays(path) or _stack(path)):
         return lines
     if suffix in _WEIGHTS or path.name.endswith(".index.json"):
         return _weights(path, weights)
@@ -177,6 +179,36 @@ def _lines(path: Path) -> list[str]:
         "features, a head"
     )
     raise UserError(f"{path} has no known format. Known are {known}, images and videos.")
+
+
+def _container(path: Path) -> list[str]:
+    """Return lines about HDF5 or zarr, whose cameras --keys chooses, [] for anything else."""
+    from anytouch_jax.data import containers
+    from anytouch_jax.datasets.readers.containers import describe_container
+
+    kind = containers.kind_of(path)
+    if kind not in ("hdf5", "zarr"):
+        return []
+    with containers.open_container(path) as container:
+        lines = describe_container(container)
+    command = f"anytouch data index {kind} {path} --sensor NAME --keys KEY"
+    return [f"{path}: {kind}", *lines, f"make a manifest of it: {command}"]
+
+
+def _stack(path: Path) -> list[str]:
+    """Return lines about the stacks of frames in an .npz, [] for one without."""
+    from anytouch_jax.data.containers import open_container
+
+    with open_container(path) as container:
+        stacks = [one for one in container.fields() if one.form is not None and not one.form.single]
+    if not stacks or any(len(one.shape) < 4 for one in stacks):
+        return []  # weights have arrays of two and three axes
+    lines = [
+        f"{one.key}: {one.form.frames} frames, {one.form.words(one.dtype)}"
+        for one in stacks
+        if one.form is not None
+    ]
+    return [f"{path}: a stack of frames", *lines, "use it with embed and measure"]
 
 
 def _images(path: Path) -> list[str]:

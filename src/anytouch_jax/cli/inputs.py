@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from anytouch_jax.cli.arguments import DEFAULT
+from anytouch_jax.cli.heads import head_in_use
 from anytouch_jax.cli.output import log, refuse_join, refuse_unused
 from anytouch_jax.config import FIELD_SENSORS, UNIVERSAL, check_spelling
 from anytouch_jax.config.parsing import Count
@@ -34,8 +35,8 @@ class SensorOptions:
     # Encoder: a name (`anytouch info encoders`), a run, a weights file, or hf://user/repo.
     model: Path = Path(DEFAULT)
     sensor: str | None = None
-    """Sensor of the frames: a name, or a folder NAME.sensor of `anytouch sensor fit`. Without it,
-    or if it is unknown, the universal tokens are used.
+    """Sensor of the frames: a name, or a folder NAME.sensor of `anytouch sensor fit` or `sensor
+    calibrate`. Without it, or if it is unknown, the universal tokens are used.
     """
     # Image of the untouched gel: it is subtracted, and decides contact.
     background: Path | None = None
@@ -103,6 +104,14 @@ def takes_manifest(options: SensorOptions, data: Sequence[Path], of_rows: Sequen
     if not data[0].exists():
         raise UserError(
             f"there is no manifest, folder or video at {data[0]}. Give another path with --data."
+        )
+    from anytouch_jax.data.containers import kind_of
+
+    kind = kind_of(data[0])
+    if kind in ("hdf5", "zarr"):
+        raise UserError(
+            f"{data[0]} is {kind}, which can hold several cameras and recordings. Make a manifest "
+            f"of it: anytouch data index {kind} {data[0]} --sensor NAME"
         )
     refuse_unused(options, of_rows, "with a folder or a video, which has no splits and no columns")
     return False
@@ -183,36 +192,6 @@ def load_inputs(options: FrameOptions) -> Inputs:
             encoder.source, encoder.fingerprint, pooling, options.frames, options.aggregation
         )
     return Inputs(encoder, pooling, head)
-
-
-def head_in_use(
-    model: Path, named: Path | None, misfit: Callable[[Head], str] = lambda head: ""
-) -> Head | None:
-    """Return the head that a user named, else that which lies with the encoder.
-
-    Args:
-        model: the encoder.
-        named: the head of --head.
-        misfit: returns the options that the encoder's own head needs, "" if it fits. Else it is
-            left out, which is logged.
-    """
-    from anytouch_jax.encoder.linear_head import find_head, load_head
-    from anytouch_jax.weights import registry
-
-    if named is not None:
-        return load_head(named)
-    if str(model).startswith("hf:"):  # `load_encoder` downloads it
-        return None
-    own = find_head(registry.locate(model))
-    if own is None:
-        return None
-    head = load_head(own)
-    needs = misfit(head)
-    if needs:
-        log(f"the head of {model} is not used: it needs {needs}")
-        return None
-    log(f"head: {own}, for {head.label}")
-    return head
 
 
 def _fits(options: FrameOptions, head: Head) -> str:
@@ -336,7 +315,7 @@ def _recording_gel(
         what = str(stored)
         is_sure = True
     else:
-        own, count = rule.recording_gel(_some_frames(data))
+        own, count = rule.recording_gel(some_frames(data))
         what = f"estimated from {count} frames of {data}"
         is_sure = count >= rule.FEWEST
     counts = rule.recognise(known, own, is_background=is_sure, untouched=stored is not None, of=of)
@@ -355,7 +334,7 @@ def _recording_gel(
     return None, "not subtracted"
 
 
-def _some_frames(data: Path) -> Iterator[np.ndarray]:
+def some_frames(data: Path) -> Iterator[np.ndarray]:
     """Yield evenly spread frames of a folder, all frames of a video, or an image.
 
     Broken ones are left out.
@@ -495,7 +474,7 @@ def _frames_of_folder(data: Path, on_bad_sample: str) -> Iterator[NumberedFrame]
     # The first frame number of a finger. Numbers of two fingers have a gap between them, because no
     # clip spans both.
     start = 0
-    for names in split_series([file.name for file in files]).values():
+    for names in split_series([file.relative_to(data).as_posix() for file in files]).values():
         numbers = [start + number for number in frame_numbers(names)]
         start = numbers[-1] + 2
         for number, name in zip(numbers, names, strict=True):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional
 
@@ -14,6 +14,9 @@ from anytouch_jax.cli.output import check_home, log, refuse_unused
 from anytouch_jax.config import OWN_SENSOR
 from anytouch_jax.config.parsing import Above0, Count, NotNegative, Seed
 from anytouch_jax.errors import UserError
+
+if TYPE_CHECKING:
+    from anytouch_jax.sim.fitting.comparison import Comparison
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,8 +88,8 @@ class AdaptOptions:
     Example: anytouch adapt --sensor mine.sensor --minutes 6 --out runs/mine
 
     A sensor of `anytouch sensor fit` needs no data. Ctrl-C keeps the state, and the same command
-    continues. Tokens that find fewer simulated touches than the universal ones are not saved. With
-    --data, tokens are fitted to --labels.
+    continues. If the new tokens are not shown to find more simulated touches than the universal
+    ones, the run keeps the universal ones and says so. With --data, tokens are fitted to --labels.
     """
 
     # Folder NAME.sensor of `anytouch sensor fit`, or a name in the column sensor of the manifest.
@@ -164,6 +167,7 @@ def _check_adapt(options: AdaptOptions, simulated: bool) -> None:
 def _simulated(options: AdaptOptions) -> int:
     """Train the tokens of a sensor of `anytouch sensor fit`."""
     from anytouch_jax.encoder.adapt import save
+    from anytouch_jax.sim.fitting.comparison import Comparison
     from anytouch_jax.sim.fitting.tokens import adapt_by_simulation
 
     state = options.out.with_name(f"{options.out.name}.part")
@@ -182,10 +186,32 @@ def _simulated(options: AdaptOptions) -> int:
         return 130
     save(adapted, options.model, options.out)
     shutil.rmtree(state, ignore_errors=True)
-    name = adapted.metadata["source"]["sensor"]
+    source = adapted.metadata["source"]
+    name = source["sensor"]
+    compared = Comparison(**source["compared"])
+    trained = f"tokens of {name} trained for {len(adapted.losses)} steps"
+    if compared.shown:
+        print(f"{options.out}: {trained}. {_compared(compared, name)}")
+        return 0
     print(
-        f"{options.out}: tokens of {name}, {len(adapted.losses)} steps. Of held-out simulated "
-        f"touches by {name}, the nearest one by a known sensor is the same touch in "
-        f"{adapted.after:.1%}. With universal tokens it is in {adapted.before:.1%}."
+        f"{options.out}: {name} keeps the universal tokens, because {trained} are not shown to be "
+        f"better. {_compared(compared, name)} Look at look.png of {options.sensor}, or give more "
+        "--minutes."
     )
     return 0
+
+
+def _compared(compared: Comparison, name: str) -> str:
+    """Return sentences about how many touches are found with new and with universal tokens."""
+    interval = "no interval, because all touches are of one object"
+    if compared.low is not None and compared.high is not None:
+        interval = (
+            f"95 % interval {100 * compared.low:+.1f} to {100 * compared.high:+.1f}, of "
+            f"{compared.objects} objects"
+        )
+    gain = 100 * (compared.trained - compared.universal)
+    return (
+        f"Of {compared.touches} held-out simulated touches by {name}, the nearest one by a known "
+        f"sensor is the same touch in {compared.trained:.1%}, and with universal tokens in "
+        f"{compared.universal:.1%}: {gain:+.1f} points ({interval})."
+    )

@@ -13,6 +13,7 @@ from tyro.conf import Positional
 
 from anytouch_jax.cli import embed, inputs
 from anytouch_jax.cli.arguments import DEFAULT
+from anytouch_jax.cli.heads import head_in_use
 from anytouch_jax.cli.output import check_folder, log, refuse_unused
 from anytouch_jax.config import UNIVERSAL
 from anytouch_jax.config.parsing import Above0, Count, NotNegative, Range
@@ -72,8 +73,8 @@ class StreamOptions(CameraOptions, inputs.FrameOptions):
     frames are equal).
     """
     fields: bool = False
-    """Also measure: each line has force, torque, depth, area, centre and slip, in N and mm, with
-    deviations. Shear and slip need --frames 3.
+    """Also measure: each line has force with its interval, torque, depth, area, centre and slip, in
+    N and mm, with deviations. Shear and slip need --frames 3.
     """
     # --fields: mm that the image's width shows. Known sensors need none.
     width_mm: Above0[float | None] = None
@@ -322,7 +323,7 @@ def _open_camera(options: ViewOptions, camera: str, sources: list[Source]) -> Li
     if str(options.model) == DEFAULT:
         log(f"encoder: {DEFAULT} (name another with --model)")
     encoder = load_encoder(options.model)
-    head = inputs.head_in_use(options.model, options.head)
+    head = head_in_use(options.model, options.head)
     if head is not None:
         head.check(encoder.source, encoder.fingerprint, head.pooling, 1)
     # Live touch is compared with the first features that are shown.

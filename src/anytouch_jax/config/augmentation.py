@@ -1,7 +1,7 @@
 """Augmentation of touch images: one table for its numpy form and its JAX form.
 
 Real recordings are augmented by numpy and OpenCV in the loader's threads (`data.transforms`). Next
-to simulated touches they are on the device, and so is their augmentation (`sim.batches`). Both
+to simulated touches they are on the device, and so is their augmentation (`sim.preparation`). Both
 mirror, turn, shift and zoom by the same settings, and a test compares them on the same draws. They
 differ where the table says so.
 """

@@ -20,8 +20,9 @@ _CHANNELS = (1, 3, 4)
 def read_stack(path: str | Path) -> Array | None:
     """Return the frames (T, h, w) or (T, h, w, channels) of a .npy or .npz file.
 
-    It is None for another file, and for one image in a .npy. Frames of a .npy are read when they
-    are used. Raises ImageError for a file without frames or with several arrays of them.
+    Channels may come first in the file. It is None for another file, and for one image in a .npy.
+    Frames of a .npy are read when they are used. Raises ImageError for a file without frames or
+    with several arrays of them.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -36,7 +37,7 @@ def read_stack(path: str | Path) -> Array | None:
     except (OSError, ValueError, EOFError) as error:
         raise ImageError(f"{path} cannot be read: {error}") from None
     if _is_stack(frames):
-        return frames
+        return _channels_last(frames)
     return None
 
 
@@ -63,7 +64,13 @@ def _stack_of_npz(path: Path) -> Array:
         frames = read_arrays(path, only=name.__eq__)[name]
     except (OSError, ValueError) as error:
         raise ImageError(f"{path} cannot be read: {error}") from None
-    return frames if _is_stack(frames) else frames[None]
+    return _channels_last(frames) if _is_stack(frames) else frames[None]
+
+
+def _channels_last(frames: Array) -> Array:
+    if frames.ndim == 4 and frames.shape[-1] not in _CHANNELS:
+        return np.moveaxis(frames, 1, -1)
+    return frames
 
 
 def stacked_frames(frames: Array, path: str | Path) -> Iterator[Array]:
@@ -73,11 +80,11 @@ def stacked_frames(frames: Array, path: str | Path) -> Iterator[Array]:
 
 
 def _is_stack(array: Array) -> bool:
-    """Whether an array is frames (T, h, w), or (T, h, w, channels)."""
+    """Whether an array is frames (T, h, w), or with channels last or first."""
     if not _is_pixels(array):
         return False
     if array.ndim == 4:
-        return array.shape[-1] in _CHANNELS
+        return array.shape[-1] in _CHANNELS or array.shape[1] in _CHANNELS
     # (h, w, 3) is one image.
     return array.ndim == 3 and array.shape[-1] not in _CHANNELS
 

@@ -119,6 +119,8 @@ class Encoder(Towers):
         model = self.config.model
         word = resolve_sensor(name)
         name = word.name
+        if word.family in model.sensors and name not in model.sensors:
+            name = word.family
         in_table = name in model.sensors
         # Without trained sensors nobody knows whether the universal tokens were drawn.
         drawn = self.universal_drawn or not self.trained_sensors
@@ -389,8 +391,24 @@ class Encoder(Towers):
         if not self.measures:
             raise missing(self.source)
         return open_measure(
-            self.metadata, sensor, gel, width_mm=width_mm, log=log, rotate=rotate, flip=flip
+            self.metadata,
+            sensor,
+            gel,
+            width_mm=width_mm,
+            log=log,
+            rotate=rotate,
+            flip=flip,
+            weights=lambda: self.fields_fingerprint,
         )
+
+    @cached_property
+    def fields_fingerprint(self) -> str:
+        """CRC-32 of the parameters of touch encoder and fields, in hexadecimal."""
+        parts = jax.tree.leaves(self.part_params("fields")) if "fields" in self.others else []
+        digest = int(self.fingerprint, 16)
+        for leaf in parts:
+            digest = zlib.crc32(np.ascontiguousarray(leaf).tobytes(), digest)
+        return f"{digest:08x}"
 
     @property
     def measures(self) -> bool:

@@ -11,7 +11,7 @@ from anytouch_jax.encoder.arrays import Array, Pooling
 from anytouch_jax.errors import UserError
 
 
-class Fitted(Protocol):
+class FittedOn(Protocol):
     """What a head knows of the features that it was fitted on."""
 
     @property
@@ -34,7 +34,7 @@ def scaled_features(features: npt.ArrayLike, mean: Array, scale: Array) -> Array
 
 
 def check_features_of(
-    head: Fitted, source: str, fingerprint: str, pooling: str, frames: int, aggregation: str
+    head: FittedOn, source: str, fingerprint: str, pooling: str, frames: int, aggregation: str
 ) -> None:
     """Raise UserError unless a head was fitted on such features, see `LinearHead.check`."""
     wrong = []

@@ -36,12 +36,17 @@ class Fields:
             the dots, or a guess without them.
         contact: probability.
         force: (B, 3), N along x, along y and into the gel.
+        force_low: (B,), N into the gel that 5 % of true forces are below. Errors of force are
+            factors, so the interval is not symmetric.
+        force_high: (B,), N into the gel that 5 % of true forces are above.
         torque: (B,), N mm about the centre of pressure.
         slip: (B,), fraction of the contact that slides, NaN without contact.
         area: (B,), mm2.
         centre: (B, 2), mm of the pressure from the middle of the image, x to the right and y
             down, NaN without contact.
         shape: height of the image over its width.
+        case: what is known of the device: "calibrated", "family" or "unknown". It decides how wide
+            the interval of force is.
     """
 
     depth: Array
@@ -62,6 +67,9 @@ class Fields:
     width_mm: float | None
     shape: float
     faults: tuple[str, ...] = ()
+    case: str = "unknown"
+    force_low: Array | None = None
+    force_high: Array | None = None
 
     def __len__(self) -> int:
         return len(self.depth)
@@ -118,6 +126,8 @@ class Fields:
         for place, axis in enumerate("xyz"):
             values[f"force_{axis}"] = _value_at(self.force, row, place)
             values[f"force_{axis}_std"] = _value_at(self.force_std, row, place)
+        values["force_low"] = _value_at(self.force_low, row)
+        values["force_high"] = _value_at(self.force_high, row)
         values["torque"] = _value_at(self.torque, row)
         values["torque_std"] = _value_at(self.torque_std, row)
         values["depth"] = self.depth[row, y, x]

@@ -21,12 +21,22 @@ class SensorWord(NamedTuple):
         width_mm: what the width of an image shows.
         shape: height of an image over its width.
         modulus_kpa: of the gel.
+        family: the sensor of the table that it is one of.
+        force_factor: on measured forces, from presses of known force.
+        force_spread: standard deviation of its logarithm, 0 without any.
+        force_encoder: fingerprint of the encoder that the factor holds for.
+        folder: of a fitted sensor.
     """
 
     name: str
     width_mm: float | None = None
     shape: float | None = None
     modulus_kpa: float | None = None
+    family: str = ""
+    force_factor: float = 1.0
+    force_spread: float = 0.0
+    force_encoder: str = ""
+    folder: Path | None = None
 
     @property
     def is_fitted(self) -> bool:
@@ -48,4 +58,9 @@ def resolve_sensor(word: str | Path) -> SensorWord:
         width_mm=numbers.width_mm,
         shape=numbers.height_mm / numbers.width_mm,
         modulus_kpa=numbers.modulus_kpa,
+        family=numbers.family,
+        force_factor=numbers.force_factor,
+        force_spread=numbers.force_spread,
+        force_encoder=numbers.force_encoder,
+        folder=path.expanduser(),
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from anytouch_jax.data.background.estimate import holds_press
 from anytouch_jax.data.background.layout import UnitFrames, check_layout, known_backgrounds
 from anytouch_jax.encoder.arrays import Array
 from anytouch_jax.errors import UserError
@@ -61,6 +62,10 @@ def faults_of(
         if turned:
             faults.append(
                 f"it looks {turned} when compared with its background. Read both in the same way."
+            )
+        if not turned and holds_press(background, frame):
+            faults.append(
+                "its background shows a press. Record that again, with nothing on the gel."
             )
     # A device may be built another way round than the few known ones, and half of the simulated
     # instances that the network has learned from are mirrored. With the background of the same

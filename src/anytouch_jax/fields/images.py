@@ -73,12 +73,14 @@ def _draw_shear(view: Array, one: Fields, inside: Array) -> None:
 
 
 def _line(one: Fields) -> str:
-    """Return depth and force of one frame with their deviations, as text."""
+    """Return depth with its deviation and force with its interval of one frame, as text."""
     about = one.summary()
     unit = "" if one.width_mm is None else " mm"
     line = f"{about['depth']:.2f}+-{about['depth_std']:.2f}{unit}"
     if about["force_z"] is not None:
-        line += f"  {about['force_z']:.2f}+-{about['force_z_std']:.2f} N"
+        line += (
+            f"  {about['force_z']:.2f} N ({about['force_low']:.1f} to {about['force_high']:.1f})"
+        )
     return line
 
 

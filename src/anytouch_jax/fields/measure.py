@@ -16,7 +16,6 @@ import numpy as np
 
 from anytouch_jax.batch import FieldOutput
 from anytouch_jax.data.background.dots import DotFlow
-from anytouch_jax.data.background.layout import known_backgrounds as known_backgrounds
 from anytouch_jax.data.transforms import Flip, orient_frame
 from anytouch_jax.encoder.arrays import METADATA, Array, Log
 from anytouch_jax.encoder.measured import Fields as Fields
@@ -28,6 +27,7 @@ from anytouch_jax.fields.images import depth_levels as depth_levels
 from anytouch_jax.fields.images import overlay as overlay
 from anytouch_jax.fields.images import write_surface as write_surface
 from anytouch_jax.fields.outputs import FORCE, LENGTH, TORQUE
+from anytouch_jax.fields.ruler import Ruler, another_encoder, read_ruler, ruler_of_today
 from anytouch_jax.sensors import RECORDS
 
 
@@ -47,6 +47,14 @@ GELS = {
 # kPa of an unknown gel, and its standard deviation as a fraction of it.
 OTHER_MODULUS = 170.0
 OTHER_SPREAD = 0.4
+# Logarithms of the factors from a force to the ends of its interval, down and up, of a gel that was
+# not calibrated. The deviation that the network gives comes on top. Coverage is measured by
+# `experiments.encoders.intervals`. Of unknown devices the network reads deep presses too small.
+INTERVALS = {
+    "family": (0.35, 0.35),
+    "unknown": (0.9, 1.7),
+}
+Z = 1.645  # standard deviations from the mean to 5 and 95 %
 # The deviation of a normal force is a factor. Below this force, over modulus times width squared,
 # it stays that of this force, or a force of nothing would be known exactly.
 LEAST_FORCE = 1e-3
@@ -67,6 +75,8 @@ class Scale(NamedTuple):
         spread: the modulus' standard deviation as a fraction of it.
         shape: height of the image over its width, None if nobody knows it.
         factors: by which deviations are multiplied, by name.
+        case: what is known of the device: "calibrated" by a known force, a known "family", or
+            "unknown".
     """
 
     width: float | None
@@ -74,6 +84,7 @@ class Scale(NamedTuple):
     spread: float
     shape: float | None
     factors: dict[str, float]
+    case: str = "family"
 
 
 def scale_of(metadata: Mapping[str, Any], sensor: str, width_mm: float | None = None) -> Scale:
@@ -99,22 +110,27 @@ def scale_of(metadata: Mapping[str, Any], sensor: str, width_mm: float | None = 
             "the calibration of fields in the weights is damaged; load the weights again"
         ) from None
     word = resolve_sensor(sensor)
-    gel = GELS.get(word.name)
+    known = word.name if word.name in moduli or word.name in GELS else word.family
+    gel = GELS.get(known)
     # Nobody has measured the stiffness of an own gel: sensor.json holds a usual one.
-    spread = OTHER_SPREAD if gel is None and word.name not in moduli else 0.0
+    spread = OTHER_SPREAD if gel is None and known not in moduli else 0.0
+    case = "unknown" if spread else "family"
+    if word.force_spread:
+        spread = word.force_spread
+        case = "calibrated"
     if word.width_mm is not None and word.shape is not None:
         gel = KnownGel(word.width_mm, word.shape, word.modulus_kpa or OTHER_MODULUS)
     if gel is None:
-        modulus = moduli.get(word.name, OTHER_MODULUS)
-        return Scale(width_mm, modulus, spread, shape=None, factors=factors)
+        modulus = moduli.get(known, OTHER_MODULUS)
+        return Scale(width_mm, modulus, spread, shape=None, factors=factors, case=case)
     # Another width is that of a cropped image, whose shape nobody knows.
     shape = gel.shape if width_mm is None else None
-    modulus = moduli.get(word.name, gel.modulus)
-    return Scale(width_mm or gel.width, modulus, spread, shape=shape, factors=factors)
+    modulus = moduli.get(known, gel.modulus) * word.force_factor
+    return Scale(width_mm or gel.width, modulus, spread, shape, factors, case)
 
 
 _ARRAYS = tuple(
-    one.name for one in fields(Fields) if one.name not in ("width_mm", "shape", "faults")
+    one.name for one in fields(Fields) if one.name not in ("width_mm", "shape", "faults", "case")
 )
 
 
@@ -139,7 +155,7 @@ def _array_of(part: Fields, name: str) -> Array:
     value: Array | None = getattr(part, name)
     if value is not None:
         return value
-    axes = (3,) if name.startswith("force") else ()
+    axes = (3,) if name in ("force", "force_std") else ()
     return np.full((len(part), *axes), np.nan, np.float32)
 
 
@@ -168,17 +184,10 @@ def fields_of(out: FieldOutput, scale: Scale, shape: float, faults: tuple[str, .
     out = FieldOutput._make(np.asarray(value, np.float32) for value in out)
     mm = scale.width or 1.0
     factors = scale.factors
-    rows, columns = out.depth.shape[1:]
     contact = _logistic(out.contact)
-    inside = contact > 0.5
-    cell = mm**2 * shape / (rows * columns)
-    area = cell * inside.sum((1, 2))
-    # A pixel that is in contact with probability p adds its area times the smaller of p and 1 - p.
-    area_std = cell * np.minimum(contact, 1 - contact).sum((1, 2))
-    # 1 with contact, and NaN without: where nothing touches, nothing slips and has a centre.
+    area, area_std, centre, centre_std = _contact_of(contact, out.pressure, mm, shape)
+    # 1 with contact, and NaN without: where nothing touches, nothing slips.
     touched = np.where(area > 0, 1, np.nan)
-    # The length of the rim of a round contact of this area.
-    rim = np.sqrt(4 * np.pi * area * touched)
     values: dict[str, Any] = {
         "depth": mm * out.depth,
         "depth_std": mm * LENGTH * factors["depth"] * _deviation(out.depth_log),
@@ -188,11 +197,12 @@ def fields_of(out: FieldOutput, scale: Scale, shape: float, faults: tuple[str, .
         "slip_std": touched * np.minimum(factors["slip"] * _deviation(out.slip_log), 1),
         "area": area,
         "area_std": area_std,
-        "centre": mm * _centre(inside, out.pressure, area, shape),
-        # The rim is uncertain by the area's deviation over its length, and so is the centre.
-        "centre_std": area_std / rim,
+        "centre": centre,
+        "centre_std": centre_std,
         "force": None,
         "force_std": None,
+        "force_low": None,
+        "force_high": None,
         "torque": None,
         "torque_std": None,
     }
@@ -204,7 +214,37 @@ def fields_of(out: FieldOutput, scale: Scale, shape: float, faults: tuple[str, .
         name: None if value is None else np.asarray(value, np.float32)
         for name, value in values.items()
     }
-    return Fields(**values, contact=contact, width_mm=scale.width, shape=shape, faults=faults)
+    return Fields(
+        **values,
+        contact=contact,
+        width_mm=scale.width,
+        shape=shape,
+        faults=faults,
+        case=scale.case,
+    )
+
+
+def _contact_of(
+    contact: Array, pressure: Array, mm: float, shape: float
+) -> tuple[Array, Array, Array, Array]:
+    """Return area, centre of pressure (B, 2) and their deviations; without contact NaN for those.
+
+    Args:
+        contact: (B, h, w), its probability.
+        pressure: (B, h, w).
+        mm: width of the picture.
+        shape: its height over its width.
+    """
+    rows, columns = contact.shape[1:]
+    inside = contact > 0.5
+    cell = mm**2 * shape / (rows * columns)
+    area = cell * inside.sum((1, 2))
+    # A pixel that is in contact with probability p adds its area times the smaller of p and 1 - p.
+    area_std = cell * np.minimum(contact, 1 - contact).sum((1, 2))
+    # The length of the rim of a round contact of this area, which is uncertain by the area's
+    # deviation over that length; and so is the centre.
+    rim = np.sqrt(4 * np.pi * np.where(area > 0, area, np.nan))
+    return area, area_std, mm * _centre(inside, pressure, area, shape), area_std / rim
 
 
 def _centre(inside: Array, pressure: Array, area: Array, shape: float) -> Array:
@@ -226,8 +266,13 @@ def _forces(out: FieldOutput, scale: Scale, mm: float) -> dict[str, Array]:
     deviation = _deviation(out.force_log)
     sideways = np.repeat(factors["tangential"] * FORCE * deviation[:, :1], 2, axis=1)
     normal = factors["normal"] * (out.force[:, 2:] + LEAST_FORCE) * deviation[:, 1:]
+    low, high = interval_of(
+        out.force[:, 2], factors["normal"] * deviation[:, 1], scale.case, scale.spread
+    )
     values = {
         "force": newton * out.force,
+        "force_low": newton * low,
+        "force_high": newton * high,
         "force_std": newton * np.concatenate([sideways, normal], axis=1),
         "torque": newton * mm * out.torque,
         "torque_std": newton * mm * TORQUE * factors["torque"] * _deviation(out.torque_log),
@@ -236,6 +281,25 @@ def _forces(out: FieldOutput, scale: Scale, mm: float) -> dict[str, Array]:
     for name in ("force", "torque"):
         values[f"{name}_std"] = np.hypot(values[f"{name}_std"], scale.spread * values[name])
     return values
+
+
+def interval_of(force: Array, deviation: Array, case: str, spread: float) -> tuple[Array, Array]:
+    """Return the ends of the 90 % intervals of normal forces (B,).
+
+    Errors are factors. That of the network and what is not known of the device are independent.
+
+    Args:
+        force: over modulus times width squared.
+        deviation: of their logarithms, by the network.
+        case: what is known of the device, see INTERVALS, or "calibrated".
+        spread: of a calibrated one, the deviation of the logarithm of its factor.
+    """
+    down, up = INTERVALS.get(case, (Z * spread, Z * spread))
+    own = Z * deviation
+    least = force + LEAST_FORCE
+    low = least * np.exp(-np.hypot(own, down)) - LEAST_FORCE
+    high = least * np.exp(np.hypot(own, up)) - LEAST_FORCE
+    return np.maximum(low, 0), high
 
 
 def _widen(values: dict[str, Any], scale: Scale, mm: float) -> None:
@@ -256,6 +320,9 @@ def _widen(values: dict[str, Any], scale: Scale, mm: float) -> None:
         if name in ("shear", "centre"):  # two components have one deviation
             value = value.max(-1)
         values[f"{name}_std"] = np.hypot(values[f"{name}_std"], value + size)
+    if values["force"] is not None:
+        values["force_low"] = np.zeros(len(values["force"]))
+        values["force_high"] = values["force"][:, 2] + Z * values["force_std"][:, 2]
 
 
 def _dragged(measured: Fields, scale: Scale) -> Fields:
@@ -279,12 +346,36 @@ def _dragged(measured: Fields, scale: Scale) -> Fields:
     return replace(measured, force=force, force_std=deviation)
 
 
+def _by_ruler(measured: Fields, ruler: Ruler, frames: Sequence[Array], pressure: Array) -> Fields:
+    """Return fields whose depth, contact, area and centre are those of a ruler."""
+    depth, deviation, contact = ruler.read(frames, measured.depth, measured.contact)
+    if measured.faults:
+        deviation = np.hypot(deviation, measured.depth_std)
+    area, area_std, centre, centre_std = _contact_of(
+        contact, pressure, measured.width_mm or 1.0, measured.shape
+    )
+    values: dict[str, Any] = {
+        "depth": depth,
+        "depth_std": deviation,
+        "contact": contact,
+        "area": area,
+        "area_std": np.hypot(area_std, measured.area_std if measured.faults else 0),
+        "centre": centre,
+        "centre_std": np.hypot(centre_std, measured.centre_std if measured.faults else 0),
+        "slip": np.where(area > 0, measured.slip, np.nan),
+        "slip_std": np.where(area > 0, measured.slip_std, np.nan),
+    }
+    values = {name: value.astype(np.float32) for name, value in values.items()}
+    return replace(measured, **values)
+
+
 class Measure:
     """Turns outputs of the network for frames of one sensor into `Fields`.
 
     `background` is the image of its untouched gel. If that has dots, shear is their motion
-    (`DotFlow`), and the force along the gel follows from it. `oriented` turns and mirrors images
-    as `Preprocess` does. Faults of the first frame are logged once.
+    (`DotFlow`), and the force along the gel follows from it. A `ruler` measures depth and contact.
+    `oriented` turns and mirrors images as `Preprocess` does. Faults of the first frame are logged
+    once.
     """
 
     def __init__(
@@ -295,8 +386,10 @@ class Measure:
         log: Callable[[str], None],
         rotate: int,
         flip: Flip,
+        ruler: Ruler | None = None,
     ) -> None:
         self.scale = scale
+        self._ruler = ruler
         self.oriented = partial(orient_frame, rotate=rotate, flip=flip)
         self._sensor = sensor
         self._log = log
@@ -317,6 +410,8 @@ class Measure:
             for fault in self._faults:
                 self._log(f"do not trust what is measured, its deviations are wide: {fault}")
         measured = fields_of(out, self.scale, height / width, self._faults)
+        if self._ruler is not None:
+            measured = _by_ruler(measured, self._ruler, frames, out.pressure)
         # `DotFlow` is false for a gel without dots.
         if not self._flow or self._faults:
             return measured
@@ -352,6 +447,7 @@ def measure_of(
     log: Log,
     rotate: int,
     flip: Flip,
+    weights: Callable[[], str] = str,
 ) -> Measure:
     """Return what turns outputs for frames of a sensor into `Fields`: the door of the encoder.
 
@@ -363,6 +459,22 @@ def measure_of(
         log: takes a sentence on each fault of the first frame.
         rotate: degrees by which frames are turned.
         flip: how they are mirrored after that.
+        weights: returns the fingerprint of the network, which only a calibration asks for.
+
+    Raises:
+        UserError: the sensor was calibrated with another network, or the background is not one of
+            it.
     """
     scale = scale_of(metadata, sensor, width_mm)
-    return Measure(scale, resolve_sensor(sensor).name, background, log, rotate, flip)
+    word = resolve_sensor(sensor)
+    ruler = None if word.folder is None else read_ruler(word.folder)
+    if word.force_spread and weights() != word.force_encoder:
+        raise another_encoder()
+    if ruler is not None:
+        ruler.check_network(weights())
+        if background is not None:
+            today = orient_frame(background, rotate, flip)
+            ruler, holds = ruler_of_today(ruler, today, log)
+            if not holds and scale.case == "calibrated":
+                scale = scale._replace(case="unknown", spread=max(scale.spread, OTHER_SPREAD))
+    return Measure(scale, word.family or word.name, background, log, rotate, flip, ruler)

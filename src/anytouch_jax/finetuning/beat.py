@@ -27,18 +27,18 @@ class Clock(NamedTuple):
     until: float
     watch: Watch | None
 
-    def show(self, score: str = "", before: str = "") -> None:
+    def show(self, score: str = "", before: str = "", looks: int = 0) -> None:
         """Report the time left and the scores."""
         if self.watch is not None:
-            self.watch(State(training.time_left(self.until), score, before))
+            self.watch(State(training.time_left(self.until), score, before, looks))
 
 
-class Result(NamedTuple):
+class TuneResult(NamedTuple):
     """An encoder as it is stored, its head, and the features (n, d) before and after."""
 
     encoder: Encoder
     linear: start.Linear
-    given: heads.Given
+    given: heads.HeadRows
     improved: bool
     before: start.Held
     after: start.Held
@@ -55,7 +55,7 @@ def tune(
     clock: Clock,
     ended: Callable[[], bool],
     log: Log,
-) -> Result:
+) -> TuneResult:
     """Fit the linear head, train from it, and return whichever is better."""
     target = chosen.target
     parts = chosen.parts
@@ -72,20 +72,20 @@ def tune(
     clock.show(words, words)
     until = clock.until - _RESERVE * spent
 
-    def watch(done: float, best: training.Best) -> None:
-        clock.show(best.score.text(target), words)
+    def watch(best: training.Best) -> None:
+        clock.show(best.score.text(target), words, best.looks)
 
     best = training.Best(before, before)
     note = ""
     if until <= time.monotonic():
         note = "There was no time left to train: give more --minutes."
     else:
-        task = training.Task(encoder, touches, target, parts, begin.first, before)
+        task = training.TuningTask(encoder, touches, target, parts, begin.first, before)
         best = training.train(task, options, until, watch, ended)
-    kept = Result(
+    kept = TuneResult(
         encoder=encoder,
         linear=linear,
-        given=heads.Given(chosen.rows, target, parts, x, encoder.fingerprint, tuned=False),
+        given=heads.HeadRows(chosen.rows, target, parts, x, encoder.fingerprint, tuned=False),
         improved=False,
         before=before,
         after=before,
@@ -110,6 +110,6 @@ def tune(
     )
 
 
-def head_of(result: Result, options: FinetuneOptions, log: Log) -> Head:
+def head_of(result: TuneResult, options: FinetuneOptions, log: Log) -> Head:
     """Return the head of a result, calibrated."""
     return heads.make_head(result.linear, result.given, options, log)

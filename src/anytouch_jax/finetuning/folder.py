@@ -16,7 +16,7 @@ from anytouch_jax.weights.safetensors import Loaded
 SCORES = "finetune.json"
 
 
-def check_new(out: Path) -> None:
+def refuse_filled(out: Path) -> None:
     """Raise UserError for a folder that has files, before any work."""
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         what = "is not empty"

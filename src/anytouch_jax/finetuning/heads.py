@@ -15,7 +15,7 @@ from anytouch_jax.finetuning.options import FinetuneOptions
 from anytouch_jax.finetuning.start import Linear, Parts, Target
 
 
-class Given(NamedTuple):
+class HeadRows(NamedTuple):
     """What a head is made of: its rows, features f32 (n, d) of all of them, and the encoder.
 
     `tuned` says that the encoder was trained on the rows of `parts.fit`.
@@ -29,7 +29,7 @@ class Given(NamedTuple):
     tuned: bool
 
 
-def make_head(linear: Linear, given: Given, options: FinetuneOptions, log: Log) -> Head:
+def make_head(linear: Linear, given: HeadRows, options: FinetuneOptions, log: Log) -> Head:
     """Return the head of a linear function, calibrated, and log what it promises."""
     common: dict[str, Any] = {
         "bias": linear.bias,
@@ -56,7 +56,7 @@ def make_head(linear: Linear, given: Given, options: FinetuneOptions, log: Log) 
     return head
 
 
-def _rows_of(given: Given, logits: Array, y: Array, places: Array) -> CalibrationRows:
+def _rows_of(given: HeadRows, logits: Array, y: Array, places: Array) -> CalibrationRows:
     rows = given.rows
     return CalibrationRows(
         logits=logits,
@@ -72,7 +72,7 @@ def _rows_of(given: Given, logits: Array, y: Array, places: Array) -> Calibratio
 
 
 def _calibrated_classes(
-    head: LinearHead, linear: Linear, given: Given, options: FinetuneOptions
+    head: LinearHead, linear: Linear, given: HeadRows, options: FinetuneOptions
 ) -> LinearHead:
     """Calibrate on the held-out recordings alone: the encoder has seen the labels of the others."""
     places = given.parts.val
@@ -81,7 +81,7 @@ def _calibrated_classes(
 
 
 def _calibrated_number(
-    head: NumberHead, linear: Linear, given: Given, options: FinetuneOptions
+    head: NumberHead, linear: Linear, given: HeadRows, options: FinetuneOptions
 ) -> NumberHead:
     places = given.parts.val
     rows = _rows_of(given, linear(given.x[places]), given.target.y, places)
@@ -95,7 +95,7 @@ def _calibrated_number(
 
 
 def _as_probed(
-    head: LinearHead, linear: Linear, given: Given, options: FinetuneOptions, log: Log
+    head: LinearHead, linear: Linear, given: HeadRows, options: FinetuneOptions, log: Log
 ) -> LinearHead:
     """Calibrate a linear head on a frozen encoder as `anytouch probe label --save` does."""
     split = given.rows.split.copy()

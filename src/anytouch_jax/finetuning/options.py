@@ -74,13 +74,14 @@ class FinetuneOptions:
 class State:
     """Where a run is, for a bar: the time left in seconds, and the scores on held-out recordings.
 
-    `score` is the best so far, and `before` that of the linear head. Both are None before the
-    linear head is fitted.
+    `score` is the best so far, and `before` that of the linear head. Both are "" before the linear
+    head is fitted. `looks` counts the looks at held-out recordings.
     """
 
     left: float
     score: str = ""
     before: str = ""
+    looks: int = 0
 
 
 Watch = Callable[[State], None]

@@ -15,7 +15,7 @@ from anytouch_jax.finetuning.options import Recipe
 HEAD = "head"  # name of the head among the parameters
 
 
-def rate_of(
+def depth_factor(
     name: str, shape: tuple[int, ...], recipe: Recipe, model: ModelConfig, depths: dict[str, int]
 ) -> jax.Array | float:
     """Return the factor on the learning rate of a parameter.
@@ -36,6 +36,10 @@ def rate_of(
     trunk, number = trunk_of(name)
     if trunk in depths:
         return recipe.depth_decay ** (depths[trunk] - 1 - number)
+    for other, count in depths.items():
+        # what lies beside the blocks of a trunk, such as its stem, comes before them
+        if name.startswith(other.rpartition("/")[0] + "/"):
+            return recipe.depth_decay**count
     depth = model.touch.depth
     if name.startswith("touch/blocks/"):
         each = recipe.depth_decay ** jnp.arange(depth - 1, -1, -1.0)

@@ -9,11 +9,11 @@ import numpy as np
 from anytouch_jax.encoder.arrays import Array
 from anytouch_jax.evaluate.statistics import mean_interval
 from anytouch_jax.finetuning import start
-from anytouch_jax.finetuning.beat import Result
+from anytouch_jax.finetuning.beat import TuneResult
 from anytouch_jax.finetuning.rows import Chosen
 
 
-def sentence_of(result: Result, chosen: Chosen, model: str) -> str:
+def sentence_of(result: TuneResult, chosen: Chosen, model: str) -> str:
     """Return what came of it, for a user."""
     before = result.before.text(chosen.target)
     if result.improved:
@@ -27,7 +27,7 @@ def sentence_of(result: Result, chosen: Chosen, model: str) -> str:
     )
 
 
-def test_scores(result: Result, chosen: Chosen) -> dict[str, Any] | None:
+def scores_on_test(result: TuneResult, chosen: Chosen) -> dict[str, Any] | None:
     """Return the scores of both on split test, paired by group, or None without one."""
     places = chosen.parts.test
     if not len(places):

@@ -88,7 +88,7 @@ def finetune(
     if not 0 < options.minutes < 1e6:
         raise UserError(f"minutes must be above 0, not {options.minutes:g}.")
     out = Path(out)
-    folder.check_new(out)
+    folder.refuse_filled(out)
     paths = [data] if isinstance(data, str | Path) else data
     table = manifests.read([str(path) for path in paths])
     encoder = trainable(model, options.frames)
@@ -100,7 +100,7 @@ def finetune(
     head = head_of(result, options, log)
     if encoder.subtracts:
         head = replace(head, backgrounds=backgrounds.images(chosen.ids))
-    test = report.test_scores(result, chosen)
+    test = report.scores_on_test(result, chosen)
     sentence = report.sentence_of(result, chosen, str(model))
     about: dict[str, Any] = {
         "model": str(model),

@@ -88,7 +88,7 @@ class Linear(NamedTuple):
         return np.asarray((x - self.mean) / self.scale @ self.weights + self.bias)
 
 
-class Start(NamedTuple):
+class LinearStart(NamedTuple):
     """The linear head to beat with its held-out score, and the head that training starts from.
 
     Training starts from a head with a firm penalty. One without leans on directions in which
@@ -194,7 +194,7 @@ def right_rows(outputs: Array, target: Target, places: Array) -> Array:
     return (named == truth).astype(np.float64)
 
 
-def linear_start(x: Array, target: Target, parts: Parts) -> Start:
+def linear_start(x: Array, target: Target, parts: Parts) -> LinearStart:
     """Fit the linear head on the frozen encoder, and the head that fine-tuning starts from.
 
     It is logistic or ridge regression, as `anytouch probe label` fits it, and its penalty is chosen
@@ -208,7 +208,7 @@ def linear_start(x: Array, target: Target, parts: Parts) -> Start:
     best = int(np.argmin(losses))
     firm = [place for place, one in enumerate(heads_of) if one.penalty >= FIRM]
     first = min(firm, key=lambda place: losses[place])
-    return Start(heads_of[best], scores[best], heads_of[first])
+    return LinearStart(heads_of[best], scores[best], heads_of[first])
 
 
 def _class_path(x: Array, y: Array, classes: int) -> list[Linear]:

@@ -14,9 +14,10 @@ import numpy as np
 
 from anytouch_jax.encoder.arrays import Array, Params, run_in_batches
 from anytouch_jax.encoder.base import Encoder
+from anytouch_jax.errors import UserError
 from anytouch_jax.finetuning.options import FinetuneOptions
 from anytouch_jax.finetuning.pictures import Touches, changed
-from anytouch_jax.finetuning.rates import HEAD, rate_of, steadiness, trunk_depths
+from anytouch_jax.finetuning.rates import HEAD, depth_factor, steadiness, trunk_depths
 from anytouch_jax.finetuning.start import Held, Linear, Parts, Target, held_score
 from anytouch_jax.train.loop import Work
 from anytouch_jax.train.tuning import Tuning, tune_watched
@@ -55,7 +56,7 @@ class Best:
     steps: list[tuple[float, float, Held]] = field(default_factory=list)
 
 
-class Task(NamedTuple):
+class TuningTask(NamedTuple):
     """What is tuned, and on what. `touches` are those of all rows, and `linear` is the start."""
 
     encoder: Encoder
@@ -67,10 +68,10 @@ class Task(NamedTuple):
 
 
 def train(
-    task: Task,
+    task: TuningTask,
     options: FinetuneOptions,
     until: float,
-    watch: Callable[[float, Best], None],
+    watch: Callable[[Best], None],
     ended: Callable[[], bool],
 ) -> Best:
     """Train head and encoder, and return the best parameters on the held-out rows.
@@ -81,7 +82,7 @@ def train(
         task: what is tuned.
         options: how.
         until: time of `time.monotonic` at which it ends.
-        watch: gets the ratio of the run that is done, and the best so far, at each look.
+        watch: gets the best so far, every few steps.
         ended: ends the training once it is True.
     """
     encoder = task.encoder
@@ -102,7 +103,11 @@ def train(
 
     def look(done: float, params: Params) -> None:
         if done < ((best.looks + 1) / LOOKS) ** 2:
+            watch(best)
             return
+        take(done, params)
+
+    def take(done: float, params: Params) -> None:
         best.looks += 1
         best.since += 1
         # Copies: the loop gives its arrays to the next step.
@@ -111,7 +116,10 @@ def train(
             own = interpolate(begin, now, share)
             top = own.pop(HEAD)
             linear = task.linear._replace(weights=top["kernel"], bias=top["bias"])
-            values = compute_features(features, own, task.touches.take(held))
+            try:
+                values = compute_features(features, own, task.touches.take(held))
+            except UserError:  # features that are not finite: the rates were too high
+                continue
             score = held_score(linear(values), task.target, held)
             best.steps.append((done, share, score))
             if score.beats(best.score):
@@ -119,7 +127,7 @@ def train(
                 best.encoder = own
                 best.head = linear
                 best.since = 0
-        watch(done, best)
+        watch(best)
 
     def over() -> bool:
         return ended() or (best.since >= _PATIENCE and best.looks > LOOKS / 2)
@@ -131,15 +139,17 @@ def train(
         # Tokens of sensors are left as they are: weights are loaded by rules that fill the rows of
         # sensors without training from them.
         frozen=((r"sensor_tokens$", True), ("", False)),
-        rates=lambda name, shape: rate_of(name, shape, recipe, encoder.config.model, depths),
+        rates=lambda name, shape: depth_factor(name, shape, recipe, encoder.config.model, depths),
     )
     tuning = Tuning(recipe.rate, recipe.weight_decay, steps, until, _WATCH, options.seed)
     try:
-        tune_watched(encoder.config, work, tuning, look, over)
+        result = tune_watched(encoder.config, work, tuning, look, over)
+        if best.looks < LOOKS:
+            # The last step, at the smallest rate, is rarely one of those that are asked.
+            take(1.0, result.params)
     except KeyboardInterrupt:
-        # The best is there, and what the user asks for is to stop.
-        if not best.looks:
-            raise
+        # The user asks for an end, and the best is there: at least the linear head.
+        return best
     return best
 
 
@@ -157,7 +167,7 @@ def _spread(places: Array, most: int) -> Array:
 
 
 def _batches(
-    task: Task, size: int, seed: int, start: int, stop: int
+    task: TuningTask, size: int, seed: int, start: int, stop: int
 ) -> Iterator[tuple[int, Batch, dict[str, Any]]]:
     """Yield the batch of each step: passes over the touches, each in another order."""
     rng = np.random.default_rng([19, seed % 2**63])
@@ -172,7 +182,7 @@ def _batches(
         yield step, Batch(*touches, task.target.y[places].astype(kind)), {}
 
 
-def _loss_of(task: Task, options: FinetuneOptions) -> Callable[..., Any]:
+def _loss_of(task: TuningTask, options: FinetuneOptions) -> Callable[..., Any]:
     """Return the loss of a batch: cross-entropy of smoothed labels, or squared errors of numbers.
 
     Label smoothing (Szegedy et al. 2016) keeps a head of few recordings from growing without end.

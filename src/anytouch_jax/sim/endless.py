@@ -28,7 +28,7 @@ from jax import Array
 from anytouch_jax.errors import UserError
 from anytouch_jax.sensors import Markers
 from anytouch_jax.sim.contact.mechanics import Fidelity, Gel
-from anytouch_jax.sim.draws import Draws, Leaf
+from anytouch_jax.sim.draws import Draws, Leaf, Scalar
 from anytouch_jax.sim.recorder import (
     RELIEF,
     SPACING,
@@ -147,8 +147,8 @@ class _Place(NamedTuple):
 
     thing: Array  # number of the object
     relief: Array  # its height map
-    place: Array  # (2,) mm
-    yaw: Array
+    place: Leaf  # (2,) mm
+    yaw: Scalar
     gesture: Gesture
     by_hand: Array  # bool
 
@@ -404,16 +404,14 @@ def _draw_take(
     return sensor, clip, numbers, pitch
 
 
-def _times(gesture: Gesture, frames: int, rng: Draws) -> Array:
+def _times(gesture: Gesture, frames: int, rng: Draws) -> Leaf:
     """Return the times (T,) of a clip's frames. A still is at any time that a clip may show."""
     if frames == 1:
-        shown: Array = gesture.shown * (rng.uniform(-0.5, 0.5) * 2)
-        still: Array = gesture.middle + shown[None] / 2
-        return still
+        shown = gesture.shown * (rng.uniform(-0.5, 0.5) * 2)
+        return gesture.middle + shown[None] / 2
     steps = frames - 1
     duration = gesture.shown * (steps / CLIP_OF)
-    times: Array = gesture.middle + duration * jnp.linspace(-0.5, 0.5, steps + 1)
-    return times
+    return gesture.middle + duration * jnp.linspace(-0.5, 0.5, steps + 1)
 
 
 def _cropped(rng: Draws) -> Array:

@@ -11,7 +11,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from types import ModuleType
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from anytouch_jax.config import SimulatedConfig
 from anytouch_jax.config.parsing import check
 from anytouch_jax.config.scenes import SceneOptions
 from anytouch_jax.errors import UserError
-from anytouch_jax.sim.draws import Leaf, Rng, either, namespace_of
+from anytouch_jax.sim.draws import Leaf, Rng, Scalar, either, namespace_of
 from anytouch_jax.sim.sensing.own import find_sensor, sensor_number
 from anytouch_jax.sim.sensing.sensors import THINNEST, Sensor, Unit, draw_drift, draw_unit
 from anytouch_jax.sim.world.objects import Object, catalogue, hold_out
@@ -108,23 +108,23 @@ class Touch(NamedTuple):
     number: int
     object: int  # number of the object
     split: str
-    place: Array  # (2,) mm in the object's frame
-    yaw: float  # rad of the sensor
+    place: Leaf  # (2,) mm in the object's frame
+    yaw: Scalar  # rad of the sensor
     gesture: Gesture
 
 
 class Gesture(NamedTuple):
     """A motion of the sensor. Times are in parts of the whole gesture, 0 to 1."""
 
-    depth: Any  # mm, deepest
-    motion: Any  # a number of MOTIONS
-    slide: Any  # (2,) mm in total
-    twist: Any  # rad in total
-    phases: Any  # (7,) durations of lift, press, pause, move, pause, release and lift
-    shown: Any  # duration of the clip
-    middle: Any  # time in the middle of the clip
-    lift: Any  # time at which the sensor is off for a moment, -1 for never
-    regrasp: Any  # (3,) mm, mm, rad by which it comes back moved
+    depth: Scalar  # mm, deepest
+    motion: Scalar  # a number of MOTIONS
+    slide: Leaf  # (2,) mm in total
+    twist: Scalar  # rad in total
+    phases: Leaf  # (7,) durations of lift, press, pause, move, pause, release and lift
+    shown: Scalar  # duration of the clip
+    middle: Scalar  # time in the middle of the clip
+    lift: Scalar  # time at which the sensor is off for a moment, -1 for never
+    regrasp: Leaf  # (3,) mm, mm, rad by which it comes back moved
 
 
 class Recording(NamedTuple):
@@ -134,9 +134,9 @@ class Recording(NamedTuple):
     sensor: str
     unit: Unit
     start: Array  # (3,) mm, mm, rad: the touched place in the gel's frame, and the object's turn
-    motion: Array  # (T, 3) mm, mm, rad from there, about the middle of the gel
-    depth: Array  # (T,) mm, negative without contact
-    tilt: Array  # (2,) rise per mm
+    motion: Leaf  # (T, 3) mm, mm, rad from there, about the middle of the gel
+    depth: Leaf  # (T,) mm, negative without contact
+    tilt: Leaf  # (2,) rise per mm
     gesture: Gesture
     drift: Leaf  # (T, 3, 3) of the light
     has_photo: bool
@@ -179,7 +179,7 @@ def draw_touch(scenes: Scenes, number: int, splits: Sequence[str]) -> Touch:
     return Touch(number, thing, splits[thing], place, yaw, draw_gesture(scenes.depth, rng))
 
 
-def draw_place(rng: Rng) -> tuple[Any, Any]:
+def draw_place(rng: Rng) -> tuple[Leaf, Scalar]:
     """Return a place (2,) mm within 3 mm of an object's middle, and the yaw of the sensor there."""
     xp = namespace_of(rng)
     angle = rng.uniform(0, 2 * math.pi)
@@ -215,8 +215,8 @@ def draw_gesture(depths: tuple[float, float], rng: Rng, like: Gesture | None = N
 
 
 def draw_by_hand(
-    depths: tuple[float, float], rng: Rng, gesture: Gesture, yaw: Any
-) -> tuple[Gesture, Any, Any, Any]:
+    depths: tuple[float, float], rng: Rng, gesture: Gesture, yaw: Scalar
+) -> tuple[Gesture, Scalar, Leaf, Leaf]:
     """Return another sensor's gesture, yaw, offset and tilt at a touch of grade coarse.
 
     The offset is (2,) mm, the tilt (2,) in rise per mm.
@@ -244,8 +244,8 @@ def draw_recording(scenes: Scenes, touch: Touch, sensor: str) -> Recording:
         )
     gesture = touch.gesture
     yaw = touch.yaw
-    offset = np.zeros(2)
-    tilt = np.zeros(2)
+    offset: Leaf = np.zeros(2)
+    tilt: Leaf = np.zeros(2)
     if scenes.grade == "coarse":
         gesture, yaw, offset, tilt = draw_by_hand(scenes.depth, rng, gesture, yaw)
     motion, depth = trajectory(scenes.frames, gesture)
@@ -270,7 +270,7 @@ def _mounted_straight(scenes: Scenes, kind: Sensor) -> Unit:
     )
 
 
-def trajectory(frames: int, gesture: Gesture) -> tuple[Any, Any]:
+def trajectory(frames: int, gesture: Gesture) -> tuple[Leaf, Leaf]:
     """Return motion (T, 3) since the touch, and depth (T,), negative without contact.
 
     A still is the deepest press.
@@ -283,14 +283,14 @@ def trajectory(frames: int, gesture: Gesture) -> tuple[Any, Any]:
     return moved(gesture, times, gap, np)
 
 
-def moved(gesture: Gesture, times: Any, gap: Any, xp: ModuleType) -> tuple[Any, Any]:
+def moved(gesture: Gesture, times: Leaf, gap: Scalar, xp: ModuleType) -> tuple[Leaf, Leaf]:
     """Return motion (T, 3) and depth (T,) as `trajectory` at `times` (T,).
 
     A lift lasts `gap` to both sides.
     """
     ends = xp.cumsum(gesture.phases)
 
-    def smooth(phase: int) -> Any:
+    def smooth(phase: int) -> Leaf:
         """Return how much of a phase is over, 0 to 1, with no jump of the speed at its ends."""
         x = xp.clip((times - ends[phase - 1]) / gesture.phases[phase], 0, 1)
         return x**2 * (3 - 2 * x)
@@ -321,10 +321,10 @@ def directions(recording: Recording) -> dict[str, str]:
     motion = "hold"
     twist = "none"
     slide = "none"
-    if MOTIONS[recording.gesture.motion] == "twist" and abs(turn) > MOVES[1]:
+    if MOTIONS[int(recording.gesture.motion)] == "twist" and abs(turn) > MOVES[1]:
         motion = "twist"
         twist = "clockwise" if turn > 0 else "counterclockwise"
-    elif MOTIONS[recording.gesture.motion] == "slide" and math.hypot(*slid) > MOVES[0]:
+    elif MOTIONS[int(recording.gesture.motion)] == "slide" and math.hypot(*slid) > MOVES[0]:
         motion = "slide"
         c = math.cos(float(unit.rotation))
         s = math.sin(float(unit.rotation))

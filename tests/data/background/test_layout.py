@@ -40,6 +40,13 @@ def test_no_example_of_the_package_is_called_faulty():
     assert faults_of(ring.frame[:, ::-1], ring.background, "digit", None)
 
 
+def test_a_background_that_shows_a_press_is_a_fault():
+    for touch in at.example_touches():
+        if touch.press == "ring":  # the other press looks like the dots of a gel
+            swapped = faults_of(touch.background, touch.frame, touch.sensor, None)
+            assert any("shows a press" in fault for fault in swapped), touch.sensor
+
+
 def test_an_unknown_family_has_no_references():
     assert known_backgrounds("duragel") == known_backgrounds("new_finger") == []
     found = checked("duragel", np.zeros((30, 40, 3), np.uint8), [])

@@ -11,7 +11,7 @@ from anytouch_jax.errors import UserError
 
 
 def test_every_reader_says_what_it_is():
-    assert "visgel" in READERS and "recordings" in READERS and len(READERS) == 23
+    assert "visgel" in READERS and "recordings" in READERS and len(READERS) == 25
     known = set(IndexOptions.__dataclass_fields__)
     for one in READERS.values():
         assert one.license and one.citation and set(one.uses) <= known

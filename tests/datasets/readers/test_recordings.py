@@ -1,14 +1,15 @@
 import os
+from collections import Counter
 
 import cv2
 import numpy as np
 import pytest
-from reader_world import fill
+from reader_world import Table, fill
 from refused import refused
 from videos import write_video
 
 from anytouch_jax.data.images import decode
-from anytouch_jax.datasets.readers import IndexOptions
+from anytouch_jax.datasets.readers import IndexOptions, index
 from anytouch_jax.datasets.readers.recordings import ranked_split
 from anytouch_jax.errors import UserError
 
@@ -372,3 +373,38 @@ def test_what_is_no_recording(tmp_path, read):
     ]
     assert table.reasons == {"folder called background or photo, where one image is expected": 1}
     assert set(table["sequence"]) == {".", "mug", tmp_path.name}
+
+
+def test_a_stack_of_frames_is_a_recording(tmp_path):
+    frames = np.random.default_rng(0).integers(0, 256, (6, 24, 32, 3), np.uint8)
+    for folder in ("mug", "ball", "both"):
+        (tmp_path / folder).mkdir()
+    np.save(tmp_path / "mug" / "press.npy", frames)
+    np.savez(tmp_path / "ball" / "press.npz", pixels=frames, time=np.arange(6.0))
+    np.savez(tmp_path / "ball" / "two.npz", left=frames, right=frames[:4])
+    np.save(tmp_path / "ball" / "force.npy", np.zeros(6))
+    (tmp_path / "ball" / "cut.npz").write_bytes(b"PK")
+    cv2.imwrite(str(tmp_path / "both" / "0.png"), frames[0])
+    np.save(tmp_path / "both" / "depth.npy", frames)
+    cv2.imwrite(str(tmp_path / "mug" / "background.png"), frames[5])
+    table = Table(index("recordings", tmp_path, options=IndexOptions(sensor="digit")))
+    assert Counter(table["sequence"]) == {
+        "mug/press": 6, "ball/press": 6, "ball/two/left": 6, "ball/two/right": 4, "both": 1,
+    }  # fmt: skip
+    for path, row in table.rows.items():
+        if path != "both/0.png":
+            np.testing.assert_array_equal(decode(tmp_path / path), frames[row["frame_index"]])
+            assert row["object"] == path.split("/")[0]
+    assert table.rows["mug/press.npy/3"]["background_path"] == "mug/background.png"
+    assert table.rows["ball/two.npz/left/0"]["unit"] == "left"
+    assert len(table.clips(3)) == 4 + 4 + 4 + 2
+    assert set(table.reasons) == {
+        "array next to images", "file that cannot be read",
+        "array that is no image and no stack of frames",
+    }  # fmt: skip
+    # each is a touch alone, or ordered by the times of the files
+    singles = IndexOptions(sensor="digit", singles=True)
+    alone = Table(index("recordings", tmp_path, options=singles))
+    assert len(set(alone["sequence"])) == 23 and not len(alone.clips(3))
+    by_time = IndexOptions(sensor="digit", order="times")
+    assert len(index("recordings", tmp_path, options=by_time).manifest) == 23

@@ -7,6 +7,8 @@ import pytest
 from tiny_models import tiny_config
 
 from anytouch_jax.encoder.encoder import random_encoder
+from anytouch_jax.encoder.linear_head import load_head
+from anytouch_jax.live.page.longer import LongerTraining
 from anytouch_jax.live.page.teach import LiveRecorder, Teacher
 
 RECORDINGS = 16
@@ -20,13 +22,13 @@ def encoder():
     return random_encoder(tiny_config())
 
 
-def taught(encoder, folder, names, features):
+def taught(encoder, folder, names, features, sensor="digit"):
     """Return the teacher of recordings of these names, with features (recordings, FRAMES, WIDTH).
 
     Every recording has images of its own, and its frames differ by noise.
     """
     rng = np.random.default_rng(1)
-    recorder = LiveRecorder(folder, "digit")
+    recorder = LiveRecorder(folder, sensor)
     for name, several in zip(names, features, strict=True):
         look = rng.integers(40, 200, (6, 8, 3))
         recorder.start(name, np.full((24, 32, 3), 128, np.uint8))
@@ -36,7 +38,7 @@ def taught(encoder, folder, names, features):
         recorder.stop()
     teacher = Teacher(encoder, recorder, log=lambda _: None)
     teacher.train()
-    end = time.monotonic() + 60
+    end = time.monotonic() + 600
     while teacher.about()["training"] and time.monotonic() < end:
         time.sleep(0.02)
     about = teacher.about()
@@ -73,3 +75,36 @@ def test_a_label_that_touches_carry_is_named_on_new_recordings(encoder, tmp_path
     features[..., : WIDTH // 2] += 8.0 * (names == "cup")[:, None, None]
     result = taught(encoder, tmp_path / "touches", names, features).about()["result"]
     assert result["right"] > 0.95 and result["pixels"] < 0.75
+
+
+def test_pages_on_two_sensors_have_a_head_each_in_one_folder(encoder, tmp_path):
+    rng = np.random.default_rng(0)
+    names = np.array(["cup", "key"] * 3)
+    heads = {}
+    for sensor in ("digit", "gelsight"):
+        features = by_recording(rng)[:6]
+        heads[sensor] = taught(encoder, tmp_path / "touches", names, features, sensor).head
+    folder = tmp_path / "touches"
+    assert (folder / "head.npz").is_file() and (folder / "head_gelsight.npz").is_file()
+    for sensor, head in heads.items():
+        again = Teacher(encoder, LiveRecorder(folder, sensor), log=lambda _: None)
+        np.testing.assert_array_equal(again.head.weights, head.weights)
+        file = again.about()["file"]
+        np.testing.assert_array_equal(load_head(file).weights, head.weights)
+
+
+def test_what_was_trained_longer_is_of_one_sensor(tmp_path):
+    """A page finds its own folder, and that of another sensor is not replaced."""
+    folder = tmp_path / "touches"
+    shown = {}
+    for sensor in ("digit", "gelsight", "digit"):
+        recorder = LiveRecorder(folder, sensor)
+        shown[sensor] = LongerTraining(None, recorder, print).about()["folder"]
+        tuned = folder / "tuned"
+        if not tuned.is_dir():
+            tuned.mkdir(parents=True)
+            (tuned / "sensor.txt").write_text(sensor)
+    assert shown == {
+        "digit": str(folder / "tuned"),
+        "gelsight": str(folder / "tuned_gelsight"),
+    }

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from anytouch_jax.sim.endless import SimulatedTouches
-from anytouch_jax.sim.fitting import tokens, touches
+from anytouch_jax.sim.fitting import comparison, touches
 from anytouch_jax.sim.fitting.touches import COUNT, own_touches, own_world
 from anytouch_jax.sim.sensing.own import OwnSensor, write_sensor
 from anytouch_jax.sim.sensing.sensors import SENSORS, look
@@ -61,7 +61,8 @@ def test_each_touch_is_felt_by_a_known_sensor_and_by_yours(felt):
 def batch_of(by_known):
     """Touches of which the first take is by a known sensor or by yours."""
     sensor = np.stack([by_known, 0 * by_known], 1)
-    return SimulatedTouches(None, None, sensor, None, None, None, None, None, None, {})
+    touched = np.arange(len(by_known))
+    return SimulatedTouches(None, None, sensor, touched, None, None, None, None, None, {})
 
 
 def test_the_score_is_the_fraction_of_touches_whose_nearest_is_the_same_touch():
@@ -73,4 +74,5 @@ def test_the_score_is_the_fraction_of_touches_whose_nearest_is_the_same_touch():
     own[0, 1] = own[1, 2] = other[0, 0]  # by yours twice: they do not count
     own[1, 1] = 0.9 * other[1, 1] + other[1, 3]  # nearer to a touch that is no rival
     parts = iter(zip(own, other, strict=True))
-    assert tokens._found(held, lambda train, one: next(parts), {}) == pytest.approx(4 / 5)
+    found = comparison.found_touches(held, lambda train, one: next(parts), {}).found
+    assert found.mean() == pytest.approx(4 / 5)

@@ -14,10 +14,9 @@ from runs import run_config
 from anytouch_jax.cli import app
 from anytouch_jax.config import to_json
 from anytouch_jax.encoder.encoder import load_encoder
-from anytouch_jax.errors import CheckError
 from anytouch_jax.nn.functional import build
 from anytouch_jax.sim.endless import SimulatedTouches
-from anytouch_jax.sim.fitting import contrast, tokens
+from anytouch_jax.sim.fitting import comparison, contrast, tokens
 from anytouch_jax.sim.sensing.own import OwnSensor, write_sensor
 from anytouch_jax.sim.sensing.sensors import SENSORS, look
 from anytouch_jax.train import pace
@@ -38,9 +37,16 @@ def felt(key, world, *, size):
         np.int32
     )
     none = np.zeros(contrast.COUNT, np.int32)
+    thing = np.arange(contrast.COUNT, dtype=np.int32)
     return SimulatedTouches(
-        clip, np.full_like(clip[:, :, 0], 128), sensor, none, none, None, None, None, None, {}
+        clip, np.full_like(clip[:, :, 0], 128), sensor, thing, none, None, None, None, None, {}
     )
+
+
+def found(share, objects=100, first=0):
+    """Held-out touches of which a share is found, some of each object."""
+    order = (np.arange(200) * 61 + first) % 200
+    return comparison.Found(order < round(200 * share), np.arange(200, dtype=np.int32) % objects)
 
 
 @pytest.fixture
@@ -109,8 +115,8 @@ def test_an_interrupted_training_ends_as_an_undisturbed_one_and_moves_only_what_
         assert app.main(words) == 130
     state = tmp_path / "out.part"
     assert state.is_dir() and not (tmp_path / "out").exists()
-    scores = iter((0.2, 0.4) * 2)
-    monkeypatch.setattr(tokens, "_found", lambda *_: next(scores))
+    scores = iter((found(0.2), found(0.4)) * 2)
+    monkeypatch.setattr(tokens, "found_touches", lambda *_: next(scores))
     assert app.main(words) == 0 and not state.exists()
     assert "continuing from the checkpoint of step 18 of 30" in capsys.readouterr().err
     assert app.main([*words[: -1 - deep], str(tmp_path / "undisturbed"), *["--deep"] * deep]) == 0
@@ -132,18 +138,64 @@ def test_an_interrupted_training_ends_as_an_undisturbed_one_and_moves_only_what_
     )
 
 
-def test_tokens_that_find_fewer_touches_are_not_saved(run, mine, tmp_path, monkeypatch):
-    scores = iter((0.4, 0.2))
-    monkeypatch.setattr(tokens, "_found", lambda *_: next(scores))
-    with pytest.raises(CheckError, match=r"find 20\.0% .* nothing is saved"):
-        tokens.adapt_by_simulation(run, mine, minutes=0.01)
+@pytest.mark.parametrize(
+    ("universal", "trained", "objects", "kept"),
+    [
+        (0.40, 0.20, 100, "universal"),
+        (0.46, 0.48, 100, "universal"),  # 2 points of 200 touches are chance
+        (0.40, 0.60, 100, "trained"),
+        (0.40, 0.60, 1, "universal"),  # one object shows nothing about another one
+    ],
+)
+def test_tokens_are_kept_if_they_are_shown_to_find_more(
+    run, mine, tmp_path, monkeypatch, capsys, universal, trained, objects, kept
+):
+    scores = iter((found(universal, objects), found(trained, objects, first=7)))
+    monkeypatch.setattr(tokens, "found_touches", lambda *_: next(scores))
+    out = tmp_path / "out"
+    words = ["adapt", "--model", str(run), "--sensor", str(mine), "--minutes", "0.01"]
+    assert app.main([*words, "--out", str(out), "--deep"]) == 0
+    printed = capsys.readouterr().out
+    assert f"{trained:.1%}" in printed and f"{universal:.1%}" in printed
+    assert ("no interval" if objects == 1 else "95 % interval") in printed
+    assert ("keeps the universal tokens" in printed) == (kept == "universal")
+    before, after = (flatten(checkpoint.load_params(path)[0]) for path in (run, out))
+    moved = [
+        name
+        for name, values in before.items()
+        if not np.array_equal(values, after[name][: len(values)])
+    ]
+    assert bool(moved) == (kept == "trained"), "with the universal tokens nothing else is trained"
+    encoder = load_encoder(out)
+    assert encoder.trained_sensors[-1] == "mine"
+
+
+def test_the_interval_is_of_pairs_and_of_objects():
+    """The same touches are compared, and those of one object count once."""
+    alike = np.arange(200) % 2 == 0
+    few = alike.copy()
+    few[1:9:2] = True
+    compared = comparison.compare_found(
+        comparison.Found(alike, np.arange(200)), comparison.Found(few, np.arange(200))
+    )
+    assert compared.shown and compared.low > 0, "four touches more, and none less"
+    assert (compared.universal, compared.trained, compared.touches) == (0.5, 0.52, 200)
+    # The same four touches are of one object, which is drawn or is not.
+    objects = np.where(np.arange(200) < 9, 0, np.arange(200))
+    compared = comparison.compare_found(
+        comparison.Found(alike, objects), comparison.Found(few, objects)
+    )
+    assert not compared.shown and compared.low == 0 and compared.objects == 192
+    # Without pairs the interval would be as wide as that of two samples: some 10 points.
+    assert compared.high - compared.low < 0.08
 
 
 def test_training_finds_touches_that_the_universal_tokens_do_not(run, mine, monkeypatch):
     monkeypatch.setattr(tokens, "BATCHES", 2)
     monkeypatch.setattr(contrast, "DEEP_RATE", 3e-3)
     adapted = tokens.adapt_by_simulation(run, mine, minutes=0.25, deep=True)
-    assert len(adapted.losses) == 150 and adapted.after > adapted.before
+    compared = adapted.metadata["source"]["compared"]
+    assert len(adapted.losses) == 150 and compared["trained"] > compared["universal"]
 
 
 @pytest.mark.parametrize(

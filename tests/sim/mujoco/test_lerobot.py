@@ -81,7 +81,7 @@ def test_mistakes_are_told(tmp_path):
     refused("has no episode", writer.close)
     refused("may not be called index", writer.add, {"index": [1.0]})
     writer = LeRobotWriter(tmp_path / "new", fps=20)
-    refused("a picture u8", writer.add, {"fields": np.zeros((4, 4))})
+    refused("an image u8", writer.add, {"fields": np.zeros((4, 4))})
     writer = LeRobotWriter(tmp_path / "new", fps=20)
     writer.add({"action": [0.0, 1.0]})
     refused(r"has action of \(1,\), and the first one \(2,\)", writer.add, {"action": [0.0]})

@@ -214,6 +214,31 @@ def test_wrong_scenes_are_told_in_a_sentence():
     refused("object is 3.5 mm inside the pad pad at the start", sensor_of(model).read, data)
 
 
+def test_data_of_another_scene_are_told():
+    touch = sensor_of(scene()[0])
+    other = mujoco.MjData(mujoco.MjModel.from_xml_string(gripper()))
+    refused("another model", touch.read, other)
+    refused("no scene to read", touch.read, [])
+
+
+def test_a_rounded_pad_is_touched_in_its_middle():
+    """The surface of the gel is that of the pad's geom: a box touches a ball in the middle."""
+    flat = pressing_scene(SHAPES["box"], "digit")
+    place = flat.index('<geom name="pad" type="box"')
+    end = flat.index("friction", place)
+    ball = flat[:place] + '<geom name="pad" type="sphere" size=".02" pos="0 0 -.02" ' + flat[end:]
+    edges = []
+    for xml in (flat, ball):
+        model, data = loaded(xml)
+        touch = sensor_of(model)
+        pressed(model, data, 0.3)
+        pressure = np.asarray(touch.read(data).pressure)
+        rows, columns = pressure.shape
+        middle = pressure[rows // 2 - 2 : rows // 2 + 2, columns // 2 - 2 : columns // 2 + 2].mean()
+        edges.append(pressure.max() / middle)
+    assert edges[0] > 1.3 and edges[1] < 1.1
+
+
 def test_a_scene_with_nan_is_not_one_without_contact():
     model, data = scene()
     touch = sensor_of(model)

@@ -5,6 +5,8 @@
 * `data-000000.tar/17` is regular file 17 of a tar without compression, as WebDataset writes it.
 * `train-00000.parquet/image/17` is the cell of row 17 in a column of bytes, or of images of
   Hugging Face.
+* `press.h5/demo_0/tactile/17` is frame 17 of an array in HDF5, zarr, .npz or .npy
+  (`data.containers`).
 * `touch/00000.parquet/17` is a shard of version 1 with its index next to it.
 * `s3://bucket/train-00000.parquet/image/17` is in an object store. A shard is copied whole on its
   first use, and the copies that were not used for the longest leave first. `ANYTOUCH_CACHE` names
@@ -31,6 +33,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
 
+from anytouch_jax.data import containers
 from anytouch_jax.data.manifest.schema import ManifestError, shown
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_path, cache_folder
@@ -59,6 +62,9 @@ def read_file(path: Path) -> bytes:
     place = split_shard_path(path)
     if place is None:
         return _read_loose(path)
+    inside = containers.split_row(path)
+    if inside is not None:
+        return containers.read_row(*inside)
     shard, row = place
     if path.parent == shard:
         return _shard(shard).read(row)
@@ -72,6 +78,9 @@ def split_shard_path(path: Path) -> tuple[Path, int] | None:
             return path.parent, int(path.name)
         if path.parent.parent.suffix == ".parquet":
             return path.parent.parent, int(path.name)
+        inside = containers.split_row(path)
+        if inside is not None:
+            return inside[0], inside[2]
     return None
 
 
@@ -80,6 +89,7 @@ def close_shards() -> None:
     _shard.cache_clear()
     _column.cache_clear()
     _cached_index.cache_clear()
+    containers.close_containers()
 
 
 def _read_loose(path: Path) -> bytes:

@@ -18,13 +18,13 @@ from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.data.manifest.files import is_remote
 from anytouch_jax.data.manifest.manifest import Manifest, replace_column
 from anytouch_jax.data.manifest.schema import PATHS, SPLITS, is_manifest, table_suffix
-from anytouch_jax.datasets.readers import bags, corpora, forces, hands, lerobot, recordings, robots
 from anytouch_jax.datasets.readers.common import (
     DatasetError,
     DatasetIndex,
     DatasetReader,
     IndexOptions,
 )
+from anytouch_jax.datasets.readers.table import READERS
 from anytouch_jax.errors import UserError
 
 __all__ = [
@@ -37,8 +37,6 @@ __all__ = [
     "index",
 ]
 
-_MODULES = (hands, robots, corpora, forces, lerobot, bags, recordings)
-READERS = {name: reader for module in _MODULES for name, reader in module.READERS.items()}
 # in the schema of a Parquet file: the content hash with which `index` wrote it
 _INDEX_KEY = b"anytouch.index"
 _OTHER_OUT = "name another file with --out, in a folder that contains the data"
@@ -127,8 +125,10 @@ def index(
     options: IndexOptions | None = None,
     keep: bool = False,
 ) -> IndexReport:
-    """Read the dataset `name` in the folder `root` and write its manifest to `out` (default:
-    ROOT/<name>.parquet).
+    """Read the dataset `name` in the folder `root` and write its manifest to `out`.
+
+    By default that is ROOT/<name>.parquet, or, for a reader of files whose `root` is one of them,
+    a file of its name beside it.
 
     `out` must be in `root` or above it, because a manifest's paths may not leave its folder. With
     `keep` an edited manifest at `out` keeps its columns and values. Raises UserError for a folder
@@ -142,9 +142,14 @@ def index(
     reader = READERS[name]
     options = options or IndexOptions()
     base = Path(root).expanduser().resolve()
+    file = None
+    if base.name.lower().endswith(reader.files) and base.exists():
+        file = base.name
+        base = base.parent
     if not base.is_dir():
         problem = f"{base} is a file" if base.exists() else f"there is no folder {base}"
-        raise UserError(f"{problem}; ROOT is the folder that holds the dataset {name}")
+        endings = f", or a file {', '.join(reader.files)}" if reader.files else ""
+        raise UserError(f"{problem}; ROOT is the folder that holds the dataset {name}{endings}")
     for field in fields(IndexOptions):
         if field.name not in reader.uses and getattr(options, field.name) != field.default:
             uses = ", ".join(reader.uses) or "no option"
@@ -156,8 +161,9 @@ def index(
         raise UserError(
             f"there is no folder {lists}; --lists is the folder that holds the dataset's lists"
         )
-    target = _target(base, name, out)
-    rows = DatasetIndex(name, base, replace(options, lists=lists))
+    stem = name if file is None else file.partition(".")[0] or name
+    target = _target(base, stem, out)
+    rows = DatasetIndex(name, base, replace(options, lists=lists), file)
     reader.read(rows)
     columns = rows.columns()
     size = len(columns["path"])

@@ -122,6 +122,7 @@ class DatasetReader:
     license: str = "not stated"
     url: str = ""
     uses: tuple[str, ...] = ("val", "test")
+    files: tuple[str, ...] = ()  # endings of files that ROOT may be, instead of their folder
     paper: int | None = None
     paper_note: str = ""
 
@@ -138,9 +139,16 @@ class DatasetIndex:
     each row, `skipped` a reason to (count, first example), and `notes` are sentences for the user.
     """
 
-    def __init__(self, name: str, root: Path, options: IndexOptions | None = None) -> None:
+    def __init__(
+        self,
+        name: str,
+        root: Path,
+        options: IndexOptions | None = None,
+        file: str | None = None,
+    ) -> None:
         self.name = name
         self.root = root
+        self.file = file  # the only one in `root` to be read
         self.options = options or IndexOptions()
         self.skipped: dict[str, tuple[int, str]] = {}
         self.notes: list[str] = []
@@ -226,12 +234,20 @@ class DatasetIndex:
                 self.skip(reason, entry.path if is_text else repr(entry.path))
         return sorted(folders, key=natural), sorted(files)
 
-    def walk(self, base: str = "", inside: str = "", *, count: bool = True) -> Iterator[Folder]:
-        """Yield `base` and all folders below it, in order."""
+    def walk(
+        self,
+        base: str = "",
+        inside: str = "",
+        *,
+        count: bool = True,
+        enter: Callable[[str], bool] = lambda _: True,
+    ) -> Iterator[Folder]:
+        """Yield `base` and all folders below it, in order, but those in folders not to `enter`."""
         folders, files = self.listing(f"{base}{inside}", count=count)
         yield inside, folders, files
-        for folder in folders if inside else self.tracked(folders):
-            yield from self.walk(base, f"{inside}/{folder}".lstrip("/"), count=count)
+        entered = [folder for folder in folders if enter(folder)]
+        for folder in entered if inside else self.tracked(entered):
+            yield from self.walk(base, f"{inside}/{folder}".lstrip("/"), count=count, enter=enter)
 
     def paths(self, suffix: str, base: str = "") -> list[str]:
         """Return the paths of the files below a folder whose names end in `suffix`."""

@@ -1,10 +1,11 @@
 """Recordings of your own: a folder of images is a recording, in ROOT or at any depth below it.
 
     mine/mug/pour_1/000.png ...         the object is the first folder, the recording is the folder
-    mine/mug/pour_2.mp4                 with `--export` its frames are written into a folder of its
-    name mine/mug/background.png             the untouched gel of every recording in or below this
-    folder mine/mug/photo.jpg                  an RGB image of the touched object, for the same
-    recordings mine/mug/caption.txt                a caption, for the same recordings
+    mine/mug/pour_2.mp4                 with `--export` its frames are written into a folder
+    mine/mug/pour_3.npy, pour_4.npz     a stack of frames (frames, height, width, 3) is a recording
+    mine/mug/background.png             the untouched gel of every recording in or below this folder
+    mine/mug/photo.jpg                  an RGB image of the touched object, for the same recordings
+    mine/mug/caption.txt                a caption, for the same recordings
 
 Names decide the order and the numbers of frames (`data.names`). If numbers repeat with other words
 (left_0.png and right_0.png: two fingers), each finger is a sequence and a unit. Whole objects, or
@@ -28,7 +29,7 @@ import cv2
 import numpy as np
 import pyarrow as pa
 
-from anytouch_jax.data import images
+from anytouch_jax.data import containers, images
 from anytouch_jax.data.images import BACKGROUND, PHOTO, SUFFIXES
 from anytouch_jax.data.manifest.schema import EMPTY, REQUIRED, typed_label
 from anytouch_jax.data.names import (
@@ -106,11 +107,12 @@ def read(index: DatasetIndex) -> None:
             continue
         if not options.export:
             _skip_videos(index, folder, folders, files)
-        if fingers := _fingers(index, files, folder):
-            found[folder] = fingers
-    places = _understand(found)
+        for place, fingers in _found_in(index, files, folder).items():
+            found[place] = fingers
+            shared[place] = shared[folder]
+    places = _understand(dict.fromkeys(map(_without_ending, found)))
     recordings = [
-        _Recording(folder, unit, names, places[folder])
+        _Recording(folder, unit, names, places[_without_ending(folder)])
         for folder, fingers in found.items()
         for unit, names in fingers.items()
     ]
@@ -154,7 +156,12 @@ def _videos(index: DatasetIndex, recordings: list[_Recording]) -> list[bool]:
     videos = _videos_by_names(index, recordings)
     if options.singles or options.videos or options.order == "times":
         return videos
-    several = [at for at, one in enumerate(recordings) if videos[at] and len(one.names) > 1]
+    several = [
+        at
+        for at, one in enumerate(recordings)
+        # an array of frames has an order of its own
+        if videos[at] and len(one.names) > 1 and _without_ending(one.folder) == one.folder
+    ]
     objects = [
         (recordings[at].place.split, recordings[at].place.object, recordings[at].unit)
         for at in several
@@ -191,7 +198,7 @@ def _videos_by_names(index: DatasetIndex, recordings: list[_Recording]) -> list[
         one.names[:], is_clear = frame_order(one.names)
         if by_time:
             files = [index.root / one.folder / name for name in one.names]
-            times = {file.name: os.stat(file).st_mtime_ns for file in files}
+            times = {file.name: _time_of(file) for file in files}
             one.names.sort(key=times.__getitem__)
             is_clear = len(set(times.values())) == len(times)
         looks_like_one = looks_like_video(one.names) or len(one.names) == 1
@@ -437,9 +444,7 @@ def _moves_like_video(folders: Sequence[Sequence[Path]]) -> bool:
                 at: images.decode(paths[at])
                 for at in sorted({*starts.tolist(), *(starts + 1).tolist()})
             }
-            gaps += [
-                abs(os.stat(paths[at + 1]).st_mtime - os.stat(paths[at]).st_mtime) for at in starts
-            ]
+            gaps += [abs(_time_of(paths[at + 1]) - _time_of(paths[at])) / 1e9 for at in starts]
         except (images.ImageError, OSError):
             continue
         tiny = {
@@ -459,24 +464,69 @@ def _moves_like_video(folders: Sequence[Sequence[Path]]) -> bool:
     return is_alike and not is_slow
 
 
-def _fingers(index: DatasetIndex, files: list[str], folder: str) -> dict[str, list[str]]:
-    """Return the images of a folder by finger; arrays only if there is nothing else."""
-    names = []
+def _time_of(frame: Path) -> int:
+    """Return when the file of a frame was last changed, ns."""
+    place = containers.split_row(frame)
+    return os.stat(place[0] if place else frame).st_mtime_ns
+
+
+def _without_ending(folder: str) -> str:
+    """Return the place of a recording: mug/pour_3 of the stack mug/pour_3.npz/frames."""
+    return re.sub(r"\.np[yz](/.*)?$", "", folder, flags=re.IGNORECASE)
+
+
+def _found_in(
+    index: DatasetIndex, files: list[str], folder: str
+) -> dict[str, dict[str, list[str]]]:
+    """Return the frames of a folder by finger, or those of each stack in it, by folder or stack.
+
+    Arrays count only if there are no images, because recorders put other data beside them.
+    """
+    images = []
+    arrays = []
     for name in sorted(files, key=natural):
-        path = f"{folder}/{name}".lstrip("/")
         stem = Path(name).stem.lower()
         suffix = Path(name).suffix.lower()
-        if suffix in SUFFIXES and stem not in (BACKGROUND, PHOTO):
-            names.append(name)
+        if suffix == ".npz" or (suffix == ".npy" and stem not in (BACKGROUND, PHOTO)):
+            arrays.append(name)
+        elif suffix in SUFFIXES and stem not in (BACKGROUND, PHOTO):
+            images.append(name)
         elif suffix not in (*SUFFIXES, *MANIFESTS, *VIDEOS) and name.lower() != CAPTION:
-            index.skip("file that is no image", path)
-    arrays = [name for name in names if Path(name).suffix.lower() == ".npy"]
-    if arrays and len(arrays) < len(names):
-        index.skip("array next to images", f"{folder}/{arrays[0]}", len(arrays))
-        names = [name for name in names if name not in arrays]
-    if names:
-        return split_series(names)
-    return {}
+            index.skip("file that is no image", f"{folder}/{name}".lstrip("/"))
+    found: dict[str, dict[str, list[str]]] = {}
+    if images:
+        index.skip_all("array next to images", [f"{folder}/{name}" for name in arrays])
+    else:
+        for name in arrays:
+            stacks = _stacks(index, f"{folder}/{name}".lstrip("/"))
+            if stacks is None:
+                images.append(name)
+            else:
+                found |= stacks
+    if images:
+        found[folder] = split_series(images)
+    return found
+
+
+def _stacks(index: DatasetIndex, path: str) -> dict[str, dict[str, list[str]]] | None:
+    """Return the frames of a stack by its array and finger, None for one image.
+
+    Each array of frames in an .npz is a finger, if there are several. What cannot be read is
+    skipped.
+    """
+    try:
+        arrays = containers.stack_rows(index.root / path)
+    except containers.ContainerError as error:
+        index.skip("file that cannot be read", str(error))
+        return {}
+    if arrays is None:
+        return None
+    if not arrays:
+        index.skip("array that is no image and no stack of frames", path)
+    return {
+        f"{path}/{key}".rstrip("/"): {key if len(arrays) > 1 else "": [row.name for row in rows]}
+        for key, rows in arrays.items()
+    }
 
 
 def _is_video(name: str) -> bool:

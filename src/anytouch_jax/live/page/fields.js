@@ -166,7 +166,8 @@ function forceBar() {
       const [right, down, normal] = one.force, sideways = Math.hypot(right, down);
       most = Math.max(most, normal);
       bar.style.width = `${Math.max(0, (100 * normal) / most)}%`;
-      value.textContent = `${off(normal, one.force_std, 1)} N`;
+      value.textContent = `${normal.toFixed(1)} N`;
+      part.push(`90 % from ${one.force_low.toFixed(1)} to ${one.force_high.toFixed(1)} N (${one.case})`);
       const arrow = sideways > one.sideways_std ? ` ${"→↘↓↙←↖↑↗"[Math.round((4 * Math.atan2(down, right)) / Math.PI + 8) % 8]}` : "";
       part.push(`sideways${arrow} ${off(sideways, one.sideways_std, 1)} N`);
     }

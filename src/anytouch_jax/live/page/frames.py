@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from anytouch_jax.data.background.contact import DEFAULT_THRESHOLD, THRESHOLDS
 from anytouch_jax.data.background.rule import RunningBackground, other_unit, same_unit
 from anytouch_jax.encoder.arrays import Array
+from anytouch_jax.encoder.sensor_words import resolve_sensor
 from anytouch_jax.live.page.layers import LAYERS, touch_layer
 from anytouch_jax.live.page.setup import Setup, make_setup, measure_last
 
@@ -38,7 +39,7 @@ class FrameReader:
 
     Args:
         encoder: a loaded encoder.
-        sensor: its name, or that of the universal tokens.
+        sensor: its name, that of the universal tokens, or the folder of a fitted one.
         head: returns the head in use, whose backgrounds are looked at first.
         log: gets a sentence about a background of another sensor instance.
     """
@@ -50,7 +51,8 @@ class FrameReader:
         head: Callable[[], Head | None],
         log: Callable[[str], None],
     ) -> None:
-        self.threshold = THRESHOLDS.get(sensor, DEFAULT_THRESHOLD)
+        word = resolve_sensor(sensor)
+        self.threshold = THRESHOLDS.get(word.family or word.name, DEFAULT_THRESHOLD)
         self._encoder = encoder
         self._sensor = sensor
         self._head = head
@@ -58,7 +60,7 @@ class FrameReader:
         self._looker = ThreadPoolExecutor(1)
         self._looking: Future[None] | None = None
         self._lock = threading.Lock()  # both the page and the camera set up
-        self._setup = make_setup(encoder, sensor, 0, "none", None)
+        self._setup = make_setup(encoder, sensor, 0, "none", None, log=log)
         self._kept: deque[Kept] = deque(maxlen=_LAST)
         self._count = 0
 
@@ -101,7 +103,7 @@ class FrameReader:
         The background is estimated again.
         """
         with self._lock:
-            self._setup = make_setup(self._encoder, self._sensor, rotate, flip, None)
+            self._setup = make_setup(self._encoder, self._sensor, rotate, flip, None, log=self._log)
 
     def capture_background(self) -> None:
         """Take the newest frame as the background."""
@@ -112,7 +114,9 @@ class FrameReader:
         """Take an image RGB u8 (h, w, 3) as the background, or None to estimate it again."""
         with self._lock:
             now = self._setup
-            self._setup = make_setup(self._encoder, self._sensor, now.rotate, now.flip, image)
+            self._setup = make_setup(
+                self._encoder, self._sensor, now.rotate, now.flip, image, log=self._log
+            )
 
     def __call__(self, image: Array) -> Array:
         """Keep the image of a frame, and return it for the encoder.
@@ -154,7 +158,9 @@ class FrameReader:
 
         It is used unless the page has asked for another meanwhile.
         """
-        new = make_setup(self._encoder, self._sensor, setup.rotate, setup.flip, gel, running)
+        new = make_setup(
+            self._encoder, self._sensor, setup.rotate, setup.flip, gel, running, log=self._log
+        )
         with self._lock:
             if self._setup is setup:
                 self._setup = new

@@ -26,6 +26,12 @@ LAYERS = ("frame", "difference", "contact", "depth", "surface")
 MEASURED = LAYERS[3:]  # those that an encoder measures
 SIDE = 640  # pixels of the long side of an image on the page
 _SHARP = 480  # pixels of the long side of an image with arrows, at least
+# What is known of a device, as the page says it.
+_CASES = {
+    "calibrated": "a calibrated gel",
+    "family": "a sensor of a known kind, not calibrated",
+    "unknown": "a sensor of an unknown kind",
+}
 _SIDE = 72  # cells of a surface along the long side of the image
 # Colours of contact: red and green of a pixel are halved and raised, blue only halved.
 _TINTED = (np.arange(256)[None, :, None] / 2 + (127, 60, 0)).astype(np.uint8)
@@ -124,6 +130,9 @@ def field_numbers(measured: Fields) -> dict[str, Any]:
         "curves": {name: round(value, 4) for name, value in curves.items() if value is not None},
         "force": None if measured.force is None else [about[f"force_{axis}"] for axis in "xyz"],
         "force_std": about["force_z_std"],
+        "force_low": about["force_low"],
+        "force_high": about["force_high"],
+        "case": _CASES[measured.case],
         "sideways_std": about["force_x_std"],
         "depth": about["depth"],
         "depth_std": about["depth_std"],

@@ -75,8 +75,8 @@ class Live:
         self.recorder = LiveRecorder(out, sensor)
         pooling = "class" if head is None else head.pooling
         self.teacher = Teacher(encoder, self.recorder, pooling, log)
-        self._row = encoder.sensor_row(self.recorder.sensor, log)
-        self.frames = FrameReader(encoder, self.recorder.sensor, self._head_in_use, log)
+        self._row = encoder.sensor_row(self.recorder.word, log)
+        self.frames = FrameReader(encoder, self.recorder.word, self._head_in_use, log)
         self._nearest = NearestTouches()
         self._times: deque[tuple[float, float]] = deque(maxlen=_KEPT)
         self._newest = Shown()

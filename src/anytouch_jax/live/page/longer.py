@@ -7,6 +7,7 @@ import shutil
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -15,6 +16,7 @@ from anytouch_jax.data.background.contact import DEFAULT_THRESHOLD, THRESHOLDS
 from anytouch_jax.encoder.arrays import Array
 from anytouch_jax.encoder.linear_head import HEAD, Head, load_head
 from anytouch_jax.errors import UserError
+from anytouch_jax.files import atomic_write
 from anytouch_jax.live.page.recorder import SCORE, LiveRecorder
 
 if TYPE_CHECKING:
@@ -25,6 +27,7 @@ if TYPE_CHECKING:
 
 MINUTES = 5.0
 _FOLDER = "tuned"
+_SENSOR = "sensor.txt"  # in it: of which sensor it is
 
 
 class Tuned(NamedTuple):
@@ -53,7 +56,7 @@ class LongerTraining:
         self._encoder = encoder
         self._recorder = recorder
         self._log = log
-        self._folder = recorder.out / _FOLDER
+        self._folder = self._own_folder()
         self._busy = threading.Lock()
         self._stops = False
         self._until = 0.0
@@ -77,8 +80,20 @@ class LongerTraining:
             "said": self._said,
             "fault": self._fault,
             "used": self.tuned is not None,
-            "folder": str(self._recorder.named / _FOLDER),
+            "folder": str(self._recorder.named / self._folder.name),
         }
+
+    def _own_folder(self) -> Path:
+        """Return the folder of the result: tuned, or tuned_SENSOR beside that of another sensor.
+
+        Two pages on different sensors may share the recordings, and each has a result of its own.
+        """
+        folder = self._recorder.out / _FOLDER
+        sensor = self._recorder.sensor
+        with suppress(OSError, UnicodeDecodeError):
+            if (folder / _SENSOR).read_text(encoding="utf-8") != sensor:
+                return folder.with_name(f"{_FOLDER}_{sensor}")
+        return folder
 
     def reopen(self, head_file: Path) -> None:
         """Use the result of an earlier start, unless a head was trained after it."""
@@ -125,7 +140,7 @@ class LongerTraining:
 
         sensor = self._recorder.sensor
         # Made beside the old result, which stays until the new one is whole.
-        fresh = self._folder.with_name(f".{_FOLDER}.new")
+        fresh = self._folder.with_name(f".{_FOLDER}_{sensor}.new")
         shutil.rmtree(fresh, ignore_errors=True)
         options = FinetuneOptions(
             minutes=MINUTES,
@@ -143,7 +158,9 @@ class LongerTraining:
             watch=self._watch,
             ended=lambda: self._stops,
         )
+        atomic_write(fresh / _SENSOR, sensor)
         with self._recorder.manifest.locked():
+            self._folder = self._own_folder()  # another page may have been the first to train
             shutil.rmtree(self._folder, ignore_errors=True)
             os.replace(fresh, self._folder)
         self._said = result.sentence

@@ -18,7 +18,9 @@ from anytouch_jax.config import UNIVERSAL
 from anytouch_jax.data.images import encode
 from anytouch_jax.data.manifest.schema import EMPTY
 from anytouch_jax.encoder.arrays import Array
+from anytouch_jax.encoder.sensor_words import resolve_sensor
 from anytouch_jax.errors import UserError
+from anytouch_jax.files import read_arrays
 from anytouch_jax.live.page.shared import SharedManifest
 
 SCORE = "label.contact_score"
@@ -34,6 +36,15 @@ class _Recorded(NamedTuple):
     values: Array
 
 
+def _sensors_of(features: Path) -> set[str]:
+    """Return the sensors of a features file, none for one that is missing or damaged."""
+    try:
+        arrays = read_arrays(features, only="key/sensor".__eq__)
+    except (OSError, ValueError):
+        return set()
+    return set(arrays["key/sensor"].tolist()) if "key/sensor" in arrays else set()
+
+
 class LiveRecorder:
     """Writes frames of recordings into a folder, and then its manifest.parquet.
 
@@ -43,7 +54,9 @@ class LiveRecorder:
     def __init__(self, out: Path, sensor: str | None) -> None:
         self.out = out.expanduser().resolve()
         self.named = out
-        self.sensor = sensor or UNIVERSAL
+        # What the user calls the sensor may be its folder. Recordings have its name.
+        self.word = sensor or UNIVERSAL
+        self.sensor = resolve_sensor(self.word).name
         self.manifest = SharedManifest(self.out)
         self.file = self.manifest.file
         # of recorded frames, by their path in the manifest
@@ -54,6 +67,17 @@ class LiveRecorder:
         self._lost = 0
         self._name = ""
         self._done = ""
+
+    def head_files(self) -> tuple[Path, Path]:
+        """Return the files of a head on the recordings, and of its features.
+
+        They are head.npz and features.npz, or head_SENSOR.npz and so on beside those of another
+        sensor: two pages on different sensors may share the folder.
+        """
+        features = self.out / "features.npz"
+        if _sensors_of(features) - {self.sensor}:
+            return self.out / f"head_{self.sensor}.npz", self.out / f"features_{self.sensor}.npz"
+        return self.out / "head.npz", features
 
     def state(self) -> dict[str, Any]:
         """Return the state for the page."""

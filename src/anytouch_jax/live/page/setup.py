@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -11,6 +12,7 @@ from anytouch_jax.data.background.rule import RunningBackground
 from anytouch_jax.data.transforms import Flip, orient_frame
 from anytouch_jax.encoder.arrays import Array
 from anytouch_jax.encoder.base import Preprocess
+from anytouch_jax.errors import UserError
 from anytouch_jax.live.page.layers import last_clip, scale_down
 
 if TYPE_CHECKING:
@@ -55,16 +57,21 @@ def make_setup(
     flip: Flip,
     gel: Array | None,
     running: RunningBackground | None = None,
+    *,
+    log: Callable[[str], None] = print,
 ) -> Setup:
     """Return a setup with a background.
 
+    A background that does not fit a calibrated sensor is logged, and then nothing is measured.
+
     Args:
         encoder: what frames are prepared for.
-        sensor: its name, or that of the universal tokens.
+        sensor: its name, that of the universal tokens, or the folder of a fitted one.
         rotate: degrees clockwise.
         flip: after the rotation.
         gel: the background RGB u8 (h, w, 3), turned as frames are, None to estimate it.
         running: the estimate that `gel` comes from, if it was not given by hand.
+        log: gets that sentence.
     """
     if gel is None and running is None:
         running = RunningBackground()
@@ -73,7 +80,10 @@ def make_setup(
         small = scale_down(gel), UntouchedBackground(gel)
     measure = None
     if encoder.measures:
-        measure = encoder.measure_of(sensor, gel, log=lambda _: None)
+        try:
+            measure = encoder.measure_of(sensor, gel, log=lambda _: None)
+        except UserError as error:
+            log(str(error))
     # Frames are turned before, so the encoder's preprocessing does not.
     return Setup(rotate, flip, running, gel, small, Preprocess(encoder, gel), measure)
 

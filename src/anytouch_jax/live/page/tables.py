@@ -330,7 +330,11 @@ def open_folder(folder: Path) -> Table:
     """Return the images of a folder as one recording. Raises UserError if there are none."""
     frames, named = list_images(folder)
     return Table(
-        _one_recording(folder, [file.name for file in frames], named.get("background")),
+        _one_recording(
+            folder,
+            [file.relative_to(folder).as_posix() for file in frames],
+            named.get("background"),
+        ),
         title(folder),
     )
 

@@ -50,8 +50,7 @@ class Teacher:
         self._recorder = recorder
         self._pooling = pooling
         self._log = log
-        self.head_file = recorder.out / "head.npz"
-        self._features = recorder.out / "features.npz"
+        self.head_file, self._features = recorder.head_files()
         self.head: Head | None = None
         self.space: FeatureMap | None = None
         self.table: Table | None = None
@@ -219,6 +218,8 @@ class Teacher:
         }
         # The two files belong together: another page must not write one of them between.
         with self._recorder.manifest.locked():
+            # Again, because another page may have been the first to train.
+            self.head_file, self._features = self._recorder.head_files()
             save_npz(self._features, features, about)
             save_head(self.head_file, fitted.head)
         self._use(fitted.head)

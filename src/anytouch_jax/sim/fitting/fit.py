@@ -91,7 +91,7 @@ def see(images: Sequence[Array], background: Array | None = None) -> Seen:
         )
     dots = find_dots(gel)
     noise, spread = _noise(np.stack(frames), gel, dots)
-    change, clear = _changes([frames[i] for i in np.flatnonzero(pressed)], gel, dots)
+    change, clear = colour_changes([frames[i] for i in np.flatnonzero(pressed)], gel, dots)
     return Seen(np.stack(frames), gel, pressed, change, clear, dots, noise, spread, source)
 
 
@@ -292,13 +292,25 @@ def _noise(frames: Array, gel: Array, dots: Dots | None) -> tuple[float, float]:
     return float(np.median(deviations)), float(np.std(deviations) / np.median(deviations))
 
 
-def _changes(frames: Sequence[Array], gel: Array, dots: Dots | None) -> tuple[Array, Array]:
-    """Return the colour changes f32 (N, H, W, 3) of presses in 0..1, and where they show.
+def colour_changes(
+    frames: Sequence[Array], gel: Array, dots: Dots | None, long_side: int = WORK
+) -> tuple[Array, Array]:
+    """Return the colour changes of presses in 0..1, and where they show.
 
     A change of the light, which is a plane for each colour, is removed, and so are the dots.
+
+    Args:
+        frames: N pictures RGB u8 (h, w, 3).
+        gel: the untouched gel, of the same size.
+        dots: those of the gel.
+        long_side: pixels H or W of the result.
+
+    Returns:
+        f32 (N, H, W, 3) and bool (N, H, W).
     """
     height, width = gel.shape[:2]
-    size = (round(width * WORK / max(height, width)), round(height * WORK / max(height, width)))
+    shrink = long_side / max(height, width)
+    size = (round(width * shrink), round(height * shrink))
     changes = []
     clear = []
     for frame in frames:

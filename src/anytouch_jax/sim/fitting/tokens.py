@@ -6,7 +6,7 @@ the frozen encoder has of the known one, among the features of other touches. No
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,8 +18,9 @@ import numpy as np
 from anytouch_jax.encoder.adapt import Adapted, read_model, with_row
 from anytouch_jax.encoder.arrays import Log
 from anytouch_jax.encoder.base import precision
-from anytouch_jax.errors import CheckError, UserError
-from anytouch_jax.sim.endless import CAMERAS, SimulatedTouches
+from anytouch_jax.errors import UserError
+from anytouch_jax.sim.endless import CAMERAS
+from anytouch_jax.sim.fitting.comparison import compare_found, found_touches
 from anytouch_jax.sim.fitting.contrast import RATE, REUSE, Contrast, State, felt_batches, rate_of
 from anytouch_jax.sim.fitting.touches import own_touches, own_world
 from anytouch_jax.sim.sensing.own import read_numbers
@@ -44,8 +45,10 @@ def adapt_by_simulation(
 ) -> Adapted | None:
     """Return the model of `run` with tokens for your own sensor, trained on simulated touches.
 
-    `before` and `after` are the ratios of held-out touches that are found among some 200 by a known
-    sensor, with universal tokens and with the new ones.
+    It has the universal tokens if the new ones are not shown to be better (`Comparison.shown`).
+    `before` and `after` are the fractions of held-out touches that are found among some 200 by a
+    known sensor, with the universal tokens and with those of the model.
+    `metadata["source"]["compared"]` has the `Comparison`.
 
     Args:
         run: What `load_encoder` takes.
@@ -60,7 +63,6 @@ def adapt_by_simulation(
 
     Raises:
         UserError: For a run or a sensor that cannot be used.
-        CheckError: If the new tokens find fewer.
     """
     numbers = read_numbers(sensor)
     loaded, params = read_model(run)
@@ -87,8 +89,10 @@ def adapt_by_simulation(
             for n in range(BATCHES)
         ]
         features = jax.jit(contrast.features)
-        score = partial(_found, held, lambda train, touches: features(train, frozen, touches))
-        before = score(first)
+        score = partial(
+            found_touches, held, lambda train, touches: features(train, frozen, touches)
+        )
+        universal = score(first)
         work = Work(
             {"frozen": frozen, **first},
             contrast.loss,
@@ -115,19 +119,15 @@ def adapt_by_simulation(
         if result.interrupted:
             return None
         train = result.state.trainable
-        after = score(train)
-    if after < before:
-        raise CheckError(
-            f"the new tokens find {after:.1%} of held-out simulated touches by a known sensor, and "
-            f"the universal ones {before:.1%}: nothing is saved. Look at look.png of {sensor}, or "
-            "give more --minutes."
-        )
+        compared = compare_found(universal, score(train))
     source = {
         "run": str(run),
         "sensor": numbers.name,
         "frames": 0,
         "minutes": minutes,
         "deep": deep,
+        "tokens": "trained" if compared.shown else "universal",
+        "compared": compared._asdict(),
     }
     stored = loaded.metadata if loaded.from_run else {}
     metadata: dict[str, Any] = {
@@ -136,7 +136,12 @@ def adapt_by_simulation(
     metadata |= {"sensors": list(config.model.sensors), "source": source}
     if loaded.trained_sensors is not None:
         metadata["seen"] = [*loaded.trained_sensors, numbers.name]
-    params = params | contrast.merged(train, frozen)
+    before = compared.universal
+    after = before
+    # `with_row` gave the sensor the universal tokens, which stay if no gain is shown.
+    if compared.shown:
+        params = params | contrast.merged(train, frozen)
+        after = compared.trained
     return Adapted(config, params, result.losses, before, after, "simulated", metadata)
 
 
@@ -146,12 +151,3 @@ def _check_state(folder: Path, identity: str) -> None:
         return
     if checkpoint.read_metadata(folder).get("identity") != identity:
         raise UserError(f"{folder} belongs to another adaptation; remove it, or name another --out")
-
-
-def _found(held: list[SimulatedTouches], features: Callable[..., Any], train: State) -> float:
-    """Return the ratio of held-out touches whose nearest one by a known sensor is the same."""
-    parts = [features(train, touches) for touches in held]
-    own, other = (np.concatenate([np.asarray(part[i]) for part in parts]) for i in (0, 1))
-    by_known = np.concatenate([np.asarray(touches.sensor[:, 0]) > 0 for touches in held])
-    nearest = (own @ other[by_known].T).argmax(1)[by_known]
-    return float((nearest == np.arange(by_known.sum())).mean())

@@ -1,4 +1,4 @@
-"""Touch in MuJoCo scenes: the camera's picture and the gel's fields of a pad, as the scene moves.
+"""Touch in MuJoCo scenes: the camera's image and the gel's fields of a pad, as the scene moves.
 
 `TouchSensor` reads pads, `TouchObservation` adds them to a gymnasium environment, and
 `LeRobotWriter` writes them as a data set. They need the extra `mujoco`.

@@ -42,7 +42,7 @@ class GelView:
     """What is solved and shown. It is static under jit."""
 
     sensor: Sensor
-    size: int = 224  # pixels of the picture's short side, 0 for the sensor's resolution
+    size: int = 224  # pixels of the image's short side, 0 for the sensor's resolution
     fidelity: Fidelity = "fast"
     # "force" solves the depth to the load; "depth" takes the height map where it is
     load: Load = "force"
@@ -56,8 +56,8 @@ class GelView:
 
     @property
     def image(self) -> tuple[int, int]:
-        """(height, width) of the picture."""
-        return optics.picture_size(self.sensor, self.size)
+        """(height, width) of the image."""
+        return optics.image_size(self.sensor, self.size)
 
     @property
     def gel(self) -> Gel:
@@ -69,7 +69,7 @@ class GelView:
 
 
 class GelDevice(NamedTuple):
-    """A unit of a sensor, with what all its pictures share."""
+    """A unit of a sensor, with what all its images share."""
 
     unit: Unit
     behind: Array  # (3, H, W) of `optics.backdrop`
@@ -97,9 +97,9 @@ class GelState(NamedTuple):
 
 
 class TouchReading(NamedTuple):
-    """What the camera sees and the gel feels, at the picture's pixels (H, W).
+    """What the camera sees and the gel feels, at the image's pixels (H, W).
 
-    x points right and y down in the picture. Several pads have a leading axis.
+    x points right and y down in the image. Several pads have a leading axis.
     """
 
     image: Leaf  # u8 (H, W, 3)
@@ -127,9 +127,9 @@ def device_of(view: GelView, unit: Unit) -> GelDevice:
 
 
 def show_untouched(device: GelDevice, key: Array, view: GelView) -> Array:
-    """Return the picture u8 (H, W, 3) of a gel that nothing touches, with its noise."""
-    picture = optics.Picture(view.sensor, device.unit, view.image)
-    return optics.show(None, picture, key, behind=device.behind)
+    """Return the image u8 (H, W, 3) of a gel that nothing touches, with its noise."""
+    rendering = optics.Rendering(view.sensor, device.unit, view.image)
+    return optics.show(None, rendering, key, behind=device.behind)
 
 
 def feel(
@@ -146,7 +146,7 @@ def feel(
         device: The unit.
         state: That after the reading before, or `unloaded`.
         contact: What touches the gel.
-        key: Draws the noise of the picture.
+        key: Draws the noise of the image.
         background: u8 (H, W, 3), passed on.
         view: What is solved and shown, static under jit.
 
@@ -171,19 +171,19 @@ def feel(
     change = squeezed - state.squeezed
     sheared = _sheared(state, press, contact, change, device.unit, view)
     moved = sheared.displacement + squeezed
-    picture = optics.Picture(view.sensor, device.unit, view.image)
+    rendering = optics.Rendering(view.sensor, device.unit, view.image)
     skin = optics.Skin(press.displacement, moved, pitch)
     mirror = jnp.asarray(device.unit.mirror)
     force = jnp.stack([*(sheared.force * mirror), press.force])
     onto = partial(
-        optics.onto_picture,
+        optics.onto_image,
         pitch=pitch,
         sensor=view.sensor,
         unit=device.unit,
         resolution=view.image,
     )
     reading = TouchReading(
-        image=optics.show(skin, picture, key, behind=device.behind),
+        image=optics.show(skin, rendering, key, behind=device.behind),
         background=jnp.asarray(background),
         depth=onto(press.displacement[..., None])[..., 0],
         shear=onto(moved, vectors=True, grid=view.grid[0]),
@@ -379,7 +379,7 @@ def _stiffness(press: PressResult, gel: Gel, pitch: float) -> Array:
     touching = jnp.maximum(mechanics.area(press.pressure, pitch), pitch**2)
     modulus = gel.modulus / (2 * (1 + gel.poisson))
     circle = 8 * modulus * jnp.sqrt(touching / jnp.pi) / (2 - gel.poisson)
-    return (circle + modulus * touching / gel.thickness) * KPA_MM2
+    return jnp.asarray((circle + modulus * touching / gel.thickness) * KPA_MM2)
 
 
 def _coarse(view: GelView) -> tuple[int, int]:

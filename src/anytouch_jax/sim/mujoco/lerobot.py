@@ -35,7 +35,7 @@ class LeRobotWriter:
             writer.add({"observation.images.tactile": image, "action": action})
             writer.end_episode("hold the cup")
 
-    An array u8 (H, W, 3) is a picture, others are vectors of float32. Call a tactile camera
+    An array u8 (H, W, 3) is an image, others are vectors of float32. Call a tactile camera
     `observation.images.tactile...`, so that it is recognised. meta/info.json is written last, when
     the block ends: without it nothing is a data set. Episodes that did not end are left out.
 
@@ -57,7 +57,7 @@ class LeRobotWriter:
         self._fps = fps
         self._robot = robot
         self._shapes: dict[str, tuple[int, ...]] = {}
-        self._pictures: set[str] = set()
+        self._images: set[str] = set()
         self._frames: list[dict[str, Any]] = []
         self._episodes: list[dict[str, Any]] = []
         self._tasks: dict[str, int] = {}
@@ -95,7 +95,7 @@ class LeRobotWriter:
                     f"a frame has {name} of {np.shape(value)}, and the first one {shape}; give all "
                     "frames the same features"
                 )
-            if name in self._pictures:
+            if name in self._images:
                 row[name] = {"bytes": _png(value), "path": None}
                 self._sums[name].add(value.reshape(-1, 3) / 255)
             else:
@@ -112,16 +112,16 @@ class LeRobotWriter:
         for name, value in arrays.items():
             if "/" in name or name in (*_COUNTED, "timestamp"):
                 raise UserError(f"a feature may not be called {name}")
-            is_picture = value.dtype == np.uint8 and value.ndim == 3 and value.shape[-1] == 3
-            if not is_picture and value.ndim > 1:
+            is_image = value.dtype == np.uint8 and value.ndim == 3 and value.shape[-1] == 3
+            if not is_image and value.ndim > 1:
                 raise UserError(
-                    f"{name} has the shape {value.shape}: a feature is a picture u8 (H, W, 3) or a "
+                    f"{name} has the shape {value.shape}: a feature is an image u8 (H, W, 3) or a "
                     "vector"
                 )
-            if is_picture:
-                self._pictures.add(name)
+            if is_image:
+                self._images.add(name)
             self._shapes[name] = np.atleast_1d(value).shape
-            self._sums[name] = _Sums(3 if is_picture else self._shapes[name][0])
+            self._sums[name] = _Sums(3 if is_image else self._shapes[name][0])
 
     def end_episode(self, task: str) -> None:
         """End the current episode, and write its frames. `task` says in words what was to be done.
@@ -164,7 +164,7 @@ class LeRobotWriter:
     def _column(self, name: str) -> pa.Array:
         """Return a column of the current episode."""
         values = [row[name] for row in self._frames]
-        if name in self._pictures:
+        if name in self._images:
             return pa.array(values, pa.struct([("bytes", pa.binary()), ("path", pa.string())]))
         if self._shapes[name] == (1,):
             return pa.array(np.concatenate(values))
@@ -181,7 +181,7 @@ class LeRobotWriter:
             pa.parquet.write_table(pa.Table.from_pylist(self._episodes), part)
         with atomic_path(self._root / "meta/tasks.parquet") as part:
             pa.parquet.write_table(_tasks_table(self._tasks), part)
-        stats = {name: one.result(name in self._pictures) for name, one in self._sums.items()}
+        stats = {name: one.result(name in self._images) for name, one in self._sums.items()}
         atomic_write(self._root / "meta/stats.json", json.dumps(stats, indent=4))
         atomic_write(self._root / "meta/info.json", json.dumps(self._info(), indent=4))
         self._closed = True
@@ -190,9 +190,9 @@ class LeRobotWriter:
         """Return meta/info.json."""
         features: dict[str, Any] = {}
         for name, shape in self._shapes.items():
-            is_picture = name in self._pictures
-            names = ["height", "width", "channels"] if is_picture else None
-            kind = "image" if is_picture else "float32"
+            is_image = name in self._images
+            names = ["height", "width", "channels"] if is_image else None
+            kind = "image" if is_image else "float32"
             features[name] = {"dtype": kind, "shape": list(shape), "names": names}
         features["timestamp"] = {"dtype": "float32", "shape": [1], "names": None}
         features |= {name: {"dtype": "int64", "shape": [1], "names": None} for name in _COUNTED}
@@ -233,21 +233,21 @@ class _Sums:
         self._least = np.minimum(self._least, rows.min(0))
         self._most = np.maximum(self._most, rows.max(0))
 
-    def result(self, is_picture: bool) -> dict[str, Any]:
-        """Return LeRobot's statistics. Those of a picture are (3, 1, 1)."""
+    def result(self, is_image: bool) -> dict[str, Any]:
+        """Return LeRobot's statistics. Those of an image are (3, 1, 1)."""
         mean = self._sum / self._count
         spread = np.sqrt(np.maximum(self._squares / self._count - mean**2, 0))
         values = {"min": self._least, "max": self._most, "mean": mean, "std": spread}
         result: dict[str, Any] = {
-            name: (value.reshape(-1, 1, 1) if is_picture else value).tolist()
+            name: (value.reshape(-1, 1, 1) if is_image else value).tolist()
             for name, value in values.items()
         }
         return result | {"count": [self._frames]}
 
 
-def _png(picture: npt.NDArray[Any]) -> bytes:
-    """Return a picture RGB u8 (H, W, 3) as PNG."""
-    good, data = cv2.imencode(".png", np.ascontiguousarray(picture[..., ::-1]))
+def _png(image: npt.NDArray[Any]) -> bytes:
+    """Return an image RGB u8 (H, W, 3) as PNG."""
+    good, data = cv2.imencode(".png", np.ascontiguousarray(image[..., ::-1]))
     assert good
     return data.tobytes()
 

@@ -1,7 +1,7 @@
 """The pad of a sensor in a MuJoCo scene: its plane, its geoms, what it meets, and its softness.
 
 The frame of a pad is that of its site, which is that of a camera behind the gel: x points right and
-y down in the picture, z out of the gel. MuJoCo's lengths are m, those of the gel are mm.
+y down in the image, z out of the gel. MuJoCo's lengths are m, those of the gel are mm.
 
 Height maps are read by rays. `mj_multiRay` shoots them all from one point, so that point lies
 `FAR` behind the pad, and they are parallel to within a hundredth of a millimetre. In a copy of the
@@ -29,7 +29,7 @@ READ = 5  # the group of geoms that rays meet; in the copy of the model all othe
 GROUPS = np.array([group == READ for group in range(6)], np.uint8)
 ON_SURFACE = 0.5  # mm by which a site may lie off the surface of its geom
 SIDES = (0.5, 2.0)  # of a pad, relative to the gel of its sensor
-LEAST_PART = 0.2  # of the picture that must show gel
+LEAST_PART = 0.2  # of the image that must show gel
 BALL = 5.0  # mm, radius of the ball whose contact sets the softness of a pad
 PRESSED = 0.2  # of the gel's thickness, the depth of that contact
 IMPEDANCE = 0.9
@@ -207,7 +207,7 @@ def _check_surface(
     part = np.mean(np.abs(np.nan_to_num(relief, nan=np.inf)) < sensor.gel.thickness)
     if part < LEAST_PART:
         raise UserError(
-            f"the geoms below the site {name} are the pad of only {part:.0%} of the picture of a "
+            f"the geoms below the site {name} are the pad of only {part:.0%} of the image of a "
             f"{sensor.name}: make them as large as its gel"
         )
 

@@ -27,7 +27,7 @@ BAD = (
 LEAST_FORCE = 1e-5  # N
 JUMP = 1e-3  # m that an object may move between readings beyond what its velocity explains
 TURN = 0.2  # rad, likewise
-EDGE = 5e-4  # m by which a contact may lie beside the picture
+EDGE = 5e-4  # m by which a contact may lie beside the image
 
 
 CLIFF = 1.0  # rise per mm between neighbours that is an edge
@@ -100,6 +100,9 @@ class Pads:
 
     def _check(self, data: mujoco.MjData) -> None:
         """Raise UserError for a scene with NaN, also if MuJoCo has reset it meanwhile."""
+        sizes = (len(data.qpos), len(data.geom_xpos), len(data.site_xpos))
+        if sizes != (self._model.nq, self._model.ngeom, self._model.nsite):
+            raise UserError("these data are of another model than the touch sensor")
         if not (np.isfinite(data.qpos).all() and np.isfinite(data.qvel).all()):
             raise UserError(
                 f"the scene has NaN in its state at {data.time:g} s, so what the pads feel is "
@@ -146,7 +149,7 @@ class Pads:
         if self._is_first or self._view.load == "depth":
             self._check_depth(data, pad, contacts, top)
         if not np.isfinite(top) or (self._view.load == "depth" and top <= 0):
-            return None  # it touches beside the picture
+            return None  # it touches beside the image
         past = self._place(data, pad, frame, max(by_body, key=lambda one: by_body[one]))
         motion = self._motion(self._past[number], past)
         unit = self._unit
@@ -174,7 +177,7 @@ class Pads:
     ) -> tuple[Array, dict[int, float], float]:
         """Return the force (3,) N on a pad in its frame, its norm by body, and the friction.
 
-        Friction is the mean of the contacts by their force. A contact beside the picture is left
+        Friction is the mean of the contacts by their force. A contact beside the image is left
         out: another part of the gel bears it.
         """
         total = np.zeros(3)

@@ -59,7 +59,7 @@ class TouchSensor:
     """What the camera of a tactile sensor in a MuJoCo scene sees, and what its gel feels.
 
     A site of type box gives the plane and the size of the pad. Its frame is that of a camera behind
-    the gel: x points right and y down in the picture, z out of the gel. The geoms of its body that
+    the gel: x points right and y down in the image, z out of the gel. The geoms of its body that
     the site lies on are the pad.
 
     With `load` "force" the gel gives way until it bears MuJoCo's normal force, and its shear bears
@@ -70,7 +70,7 @@ class TouchSensor:
         model: The scene. Its pad geoms are made as soft as the gel, unless `compliant` is false.
         site: The name of the pad's site, or several, which give readings a leading axis.
         sensor: A name, or a folder NAME.sensor.
-        size: Short side of the picture in pixels, 0 for the sensor's resolution.
+        size: Short side of the image in pixels, 0 for the sensor's resolution.
         fidelity: How contact is solved, as in `simulate_touch`.
         load: "force" or "depth".
         unit: A device, by default `nominal_unit`.
@@ -119,8 +119,7 @@ class TouchSensor:
         self.device = _device(self.view)(self._unit)
         self._states: list[GelState | None] = [None] * len(self._sites)
         self._count = 0
-        self._plain: np.ndarray | None = None
-        # The noise of the background is that of one picture that was taken before.
+        # The noise of the background is that of one image that was taken before.
         before = np.full(2, 2**32 - 1, np.uint32)
         self.background = np.asarray(_untouched(self.view)(self.device, before))
 
@@ -154,13 +153,14 @@ class TouchSensor:
         Args:
             data: The state of the scene after `mj_step` or `mj_forward`, or those of B scenes of
                 the same model, which are read by threads.
-            key: Draws the noise of the pictures, by default from the number of the reading.
+            key: Draws the noise of the images, by default from the number of the reading.
 
         Returns:
             The reading. Several scenes and several pads each add a leading axis, in this order.
 
         Raises:
-            UserError: For NaN in a scene, an object deep inside a pad at the start, and a flex.
+            UserError: For NaN in a scene, an object deep inside a pad at the start, a flex, and
+                the data of another model.
         """
         batched = not isinstance(data, mujoco.MjData)
         scenes: list[Any] = list(data) if batched else [data]
@@ -189,7 +189,9 @@ class TouchSensor:
         )
 
     def _meet(self, scenes: list[mujoco.MjData]) -> list[Met | None]:
-        """Return what each pad of each scene meets."""
+        """Return what each pad of each scene meets. Raises UserError for no scene."""
+        if not scenes:
+            raise UserError("there is no scene to read; give at least one MjData")
         while len(self._scenes) < len(scenes):
             self._scenes.append(Pads(self._model, self._sites, self.view, self._unit))
         if len(self._states) != len(scenes) * len(self._sites):
@@ -269,7 +271,7 @@ def _felt_program(view: GelView) -> Callable[..., tuple[GelState, TouchReading]]
 
 @lru_cache(maxsize=32)
 def _untouched(view: GelView) -> Callable[..., jax.Array]:
-    """Return the compiled picture of a gel that nothing touches."""
+    """Return the compiled image of a gel that nothing touches."""
 
     def one(device: GelDevice, data: jax.Array) -> jax.Array:
         return show_untouched(device, jax.random.wrap_key_data(data), view)

@@ -65,6 +65,14 @@ class OwnSensor:
     contrast: Finite[float] = 1.0  # of dents, over that of the images
     # variation of simulated devices: 1 is that of a product
     spread: Annotated[float, Range(0, 1, "0 to 1")] = 0.3
+    # The sensor of the table that it is one of. It has the tokens of this one, unless it has some
+    # of its own.
+    family: str = ""
+    # Factor on measured forces, from presses of known force, the standard deviation of its
+    # logarithm, and the fingerprint of the encoder that it holds for.
+    force_factor: Above0[float] = 1.0
+    force_spread: NotNegative[float] = 0.0
+    force_encoder: str = ""
     sure: dict = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -162,5 +170,10 @@ def write_sensor(
     arrays = {name: np.asarray(value, np.float32) for name, value in look._asdict().items()}
     np.savez(data, allow_pickle=False, bases=np.asarray(bases, np.uint8), **arrays)
     atomic_write(path / ARRAYS, data.getvalue())
-    atomic_write(path / NUMBERS, json.dumps(asdict(numbers), indent=2) + "\n")
+    write_numbers(path / NUMBERS, numbers)
     return path
+
+
+def write_numbers(file: Path, numbers: OwnSensor) -> None:
+    """Write sensor.json."""
+    atomic_write(file, json.dumps(asdict(numbers), indent=2) + "\n")

@@ -15,10 +15,10 @@ import argparse
 import dataclasses
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import jax
@@ -28,9 +28,9 @@ import numpy as np
 from anytouch_jax.batch import FieldBatch
 from anytouch_jax.config import Config, SimulatedConfig, parse_json
 from anytouch_jax.data.background.dots import DotFlow
-from anytouch_jax.fields.loss import LEAST_FORCE, TOUCHED, field_terms
+from anytouch_jax.fields.loss import LEAST_FORCE, TOUCHED, output_terms
 from anytouch_jax.fields.measure import Measure, Scale
-from anytouch_jax.fields.outputs import FORCE, LENGTH, TORQUE, FieldOutput
+from anytouch_jax.fields.outputs import FORCE, LENGTH, STATES, TORQUE, FieldOutput
 from anytouch_jax.nn.functional import build
 from anytouch_jax.objectives import normalise_touch
 from anytouch_jax.sim import endless, scene
@@ -41,18 +41,25 @@ from anytouch_jax.train.progress import to_stderr as log
 from anytouch_jax.weights.load import load_model
 from anytouch_jax.weights.registry import PARTS, locate, write_encoder
 from experiments.benchmarks import machine
+from experiments.encoders.pressed import draw_maps
 from experiments.records import write_record
 
 UNIVERSAL = 0.25  # fraction of the touches that get the universal tokens
+DEEPER = 0.35  # fraction of the touches that are pressed deeper than for the encoder
+MAPS = 336  # further height maps, beside 308 objects
+REUSE = 2  # steps in which a simulated batch is used, on average
+POOL = 64  # batches to draw from, of stills and of clips
+HEADS_FIRST = 0.03  # of the time, in which only the last layers are trained
+LAST = ("maps", "slope", "press", "whole")
 SETTINGS: dict[str, Any] = {
     "data.background": "either",
     "data.batch_size": 24,
-    "optim.learning_rate": 5e-4,
+    "optim.learning_rate": 4e-4,
     "optim.warmup": 40,
-    "optim.grad_clip": 1.0,
+    "optim.grad_clip": 20.0,
     "optim.weight_decay": 0.0,
     "run.steps": 100_000,
-    "run.save_every": 0,
+    "run.save_every": 200,
     "run.keep": 1,
     "run.figure_every": 0,
 }
@@ -123,27 +130,108 @@ def calibrate(folder: Path) -> None:
     )
 
 
+def deepened(key: jax.Array, drawn: endless.DrawnTouches) -> endless.DrawnTouches:
+    """Return touches of which a part is pressed deeper, up to three quarters of the gel.
+
+    Real fingers press thick gels by 2 mm. The world of the encoder ends at 1 mm.
+    """
+    toss, stretch = jax.random.split(key)
+    count = drawn.sensor.shape
+    deeper = jax.random.uniform(toss, count) < DEEPER
+    factor = jnp.where(deeper, jax.random.uniform(stretch, count, minval=1.0, maxval=2.4), 1.0)
+    most = 0.75 * drawn.numbers.gel[..., 1] * drawn.clip.unit.thickness
+    depth = jnp.minimum(drawn.clip.depth * factor[..., None], most[..., None])
+    return drawn._replace(clip=drawn.clip._replace(depth=depth))
+
+
+def pressed_world(maps: int) -> endless.World:
+    """Return the world of the objects that training of the encoder had, and of `maps` others.
+
+    Most of the others have flat tops (`pressed`). They are of hard materials.
+    """
+    world = world_of("train")
+    hard = np.random.default_rng(74).uniform(0.2, 0.9, maps)
+    material = np.stack([np.full(maps, 2e6), hard], 1).astype(np.float32)
+    return world._replace(
+        relief=jnp.concatenate([world.relief, draw_maps(maps, 75)]),
+        material=jnp.concatenate([world.material, material]),
+        places=jnp.concatenate([world.places, jnp.zeros((maps, *world.places.shape[1:]))]),
+    )
+
+
+class Sampled(NamedTuple):
+    """A batch to train the decoder on, with the states of the frozen encoder."""
+
+    states: jax.Array
+    batch: FieldBatch
+
+
+def sampler(
+    world: endless.World, config: Config, touch: Any
+) -> Callable[[jax.Array, int], Sampled]:
+    """Return a function of a key and the frames of a clip that simulates and encodes a batch."""
+    net = build(config.model)
+    rows = np.array(
+        [config.model.sensor_row(name) for name in SimulatedConfig().sensors]
+        + [config.model.universal_row]
+    )
+    count = config.data.batch_size
+
+    @partial(jax.jit, static_argnums=(3,))
+    def make(key: jax.Array, world: endless.World, touch: Any, frames: int) -> Sampled:
+        draw, prepare, toss, move, deep = jax.random.split(key, 5)
+        sampled = sampling(frames, wild=0.2, free=0.12)
+        drawn = deepened(deep, endless.draw_touches(draw, world, sampled, count))
+        touches = misregistered_background(move, endless.simulate_drawn(drawn, sampled))
+        batch = field_batch(prepare, touches, jnp.asarray(rows)[touches.sensor], config, count)
+        own = jax.random.uniform(toss, (count,)) >= UNIVERSAL
+        sensor = jnp.where(own, batch.sensor, config.model.universal_row)
+        batch = batch._replace(clip=normalise_touch(batch.clip), sensor=sensor)
+        encoder = net.bind({"touch": touch}).touch
+        return Sampled(encoder.states(batch.clip, batch.sensor, STATES), batch)
+
+    return lambda key, frames: make(key, world, touch, frames)
+
+
 def train(model: str, minutes: float, out: Path) -> None:
     """Train the decoder on endless touches and untouched gels that moved a little, and write the
     encoder to `out`.
+
+    The encoder is frozen. Each batch is trained on REUSE times, at random distances, because its
+    simulation and its states cost half of a step.
     """
     path = locate(model)
     loaded = load_model(path)
     folder = path if path.is_dir() else path.parent
     config, net = loaded.config.with_settings(SETTINGS), build(loaded.config.model)
-    touch = jax.device_put(loaded.params["touch"])
-    world = world_of("train", 2)
+    make = sampler(pressed_world(MAPS), config, jax.device_put(loaded.params["touch"]))
+    frames = (1, 1, 1, config.model.frames)
 
     def stream(start: int, stop: int) -> Iterator[tuple[int, Any, dict[str, Any]]]:
-        source = batches(
-            world, config, config.data.batch_size, 62, start, moved=True, wild=0.2, free=0.15
-        )
+        rng = np.random.default_rng([76, start])
+        pools: dict[int, list[Sampled]] = {}
         for step in range(start, stop):
-            yield step, (next(source), touch), {}
+            pool = pools.setdefault(frames[step % 4], [])
+            number = step // 4
+            if number % REUSE == 0 or not pool:
+                key = jax.random.fold_in(jax.random.key(76), step)
+                pool.append(make(key, frames[step % 4]))
+                del pool[:-POOL]
+            yield step, pool[int(rng.integers(len(pool)))], {}
 
-    def loss(params: Any, batch: Any, key: Any, progress: Any) -> tuple[Any, dict[str, Any]]:
-        touches, frozen = batch
-        return field_terms(params | {"touch": frozen}, touches, net=net)
+    def loss(params: Any, sampled: Sampled, key: Any, progress: Any) -> tuple[Any, dict[str, Any]]:
+        batch = sampled.batch
+        # What was trained already waits until the last layers have met the new touches.
+        begun = progress > HEADS_FIRST
+        fields = {
+            name: value
+            if name in LAST
+            else jax.tree.map(lambda x: jnp.where(begun, x, jax.lax.stop_gradient(x)), value)
+            for name, value in params["fields"].items()
+        }
+        decoder = net.bind({"fields": fields}).fields
+        outputs = decoder.with_slope(sampled.states, batch.clip, batch.aspect)
+        return output_terms(*outputs, batch)
 
     result = fit(
         config,

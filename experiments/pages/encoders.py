@@ -136,10 +136,24 @@ def measure(folder: Path) -> Page:
         )
         for name, one in balls.items()
     ]
+    flats = read_records(folder / "flats.jsonl")
+    objects = [
+        (
+            name,
+            one["deepest"],
+            one["read"],
+            *(100 * one[part] for part in ("filled", "iou", "force_bias", "force", "force_in_2")),
+        )
+        for name, one in flats.items()
+        if "filled" in one
+    ]
     devices, held = _devices(folder)
     states = _states(folder)
     low, high = (bound(row[1] for row in rows) for bound in (min, max))
+    studs = flats["studs"]
     findings = [
+        f"A grid of flat studs: the depth in contact is {100 * studs['filled']:.0f} % of the true "
+        f"one, of a coin {100 * flats['coin']['filled']:.0f} %.",
         f"Simulated: depth in contact is off by {low:.2f} to {high:.2f} mm, by sensor.",
         *(
             f"{name}: the radius is off by {100 * one['radius'][0]:.0f} %, the centre by "
@@ -148,7 +162,7 @@ def measure(folder: Path) -> Page:
         ),
     ]
     answer = "On new simulated units the depth in contact is off by this much."
-    tables = [real, devices, held, rows, along, states]
+    tables = [real, devices, held, rows, objects, along, states]
     return Page("measure", tables, findings, (answer, f"{low:.2f} to {high:.2f} mm"))
 
 

@@ -43,6 +43,7 @@ HEADS = {
     "fields": Door("fields.head:HEAD"),
     "fields measure": Door("fields.measure:measure_of"),
     "fields units": Door("fields.units:describe_units"),
+    "fields older": Door("fields.older:with_gradient"),
 }
 # Further terms of the loss, weighted by `objective.terms`. Each is an `objectives.Objective`.
 OBJECTIVES = {

@@ -13,22 +13,22 @@ from anytouch_jax.encoder.encoder import example_touches, load_encoder
 # the shear everywhere.
 LENGTHS = """
 touch                     depth mean_depth      along       down     spread       area
-dots-digit               0.5204     0.1554   -0.00877    0.01135     0.0436        101
-dots-gelsight_mini        1.056     0.5648   -0.00225    0.00705     0.0708      144.6
-dots-gelslim             0.2885     0.0851    0.00327     0.0117     0.0147       52.8
-ring-digit               0.7046     0.4498    0.00577    0.00534     0.0598      91.78
-ring-gelsight_mini        1.068     0.6856    0.00941    0.00283     0.0749      87.21
-ring-gelslim             0.4331     0.2284   -0.00136   -0.00101     0.0305      70.27
+dots-digit               0.5089     0.1598   -0.00367    0.00688    0.04209      104.2
+dots-gelsight_mini        1.086     0.5877    0.00517    0.00544    0.06947      141.7
+dots-gelslim             0.2828    0.07358   -0.00149   -0.00087    0.01331      57.86
+ring-digit               0.7526     0.4946    0.00749    0.00786    0.06181      91.95
+ring-gelsight_mini        1.076     0.6783    0.00603   -0.00545    0.07439      88.91
+ring-gelslim             0.4324     0.2193   -0.00181   -0.00871    0.02961      73.52
 """
 # mm, N and N mm.
 FORCES = """
 touch                  centre_x   centre_y    force_x    force_y    force_z     torque
-dots-digit              -0.1307    -0.9736   -0.00478    0.00666        2.1    0.03132
-dots-gelsight_mini      -0.2866     0.2781    -0.0103    0.02546      5.778   -0.01761
-dots-gelslim              1.503     -2.578    0.00701   -0.01449      1.141   -0.00961
-ring-digit               -0.377     -2.101    0.00233   -0.00461      4.231    0.02071
-ring-gelsight_mini      -0.1175     -1.381    0.00124     0.0014      5.283    0.00988
-ring-gelslim            -0.0711     -1.593    0.00038   -0.00834      3.611    0.01826
+dots-digit             -0.09372    -0.9144   -0.00449    0.00897      2.099    0.03425
+dots-gelsight_mini      -0.2454     0.3549   -0.00965    0.02421      5.925   -0.01395
+dots-gelslim              1.439     -2.664    0.00821   -0.00819      1.116   -0.01122
+ring-digit              -0.2987     -2.229    0.00109   -0.00707      4.478    0.03121
+ring-gelsight_mini     -0.05057     -1.451    0.00312   -0.00048      5.497    0.01245
+ring-gelslim            0.04805     -1.642   -0.00013   -0.01754      3.494    0.01715
 """
 RELATIVE, ABSOLUTE = 0.02, 0.0015
 

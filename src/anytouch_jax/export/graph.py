@@ -18,7 +18,17 @@ from anytouch_jax.config import IMAGENET_MEAN, IMAGENET_STD, ModelConfig
 from anytouch_jax.encoder.arrays import Pooling
 from anytouch_jax.errors import UserError
 from anytouch_jax.export.packages import needed
-from anytouch_jax.fields.outputs import FORCE, HALF, LENGTH, STATES, STRESS, TORQUE
+from anytouch_jax.fields.outputs import (
+    DIFFERENCE,
+    FORCE,
+    HALF,
+    LENGTH,
+    STATES,
+    STRESS,
+    TORQUE,
+    TOUCHED_BORDER,
+)
+from anytouch_jax.fields.poisson import border, inverse_spectrum, transforms
 from anytouch_jax.nn.sight import BLOCKS, MIDDLE, RANGE, READ
 
 OPSET = 20  # the first with Gelu
@@ -318,12 +328,11 @@ class _FieldGraph:
         pooled = graph("ReduceMean", x, [1, 2], keepdims=0)
         resized = self._resized(x, half / quarter)
         x = self._convolved(graph("Concat", resized, sharp, axis=-1), "fine1")
-        x = self._refined(x, "fine2")
-        maps = graph.dense(graph("Gelu", x), self._own["maps"])
+        x = graph("Gelu", self._refined(x, "fine2"))
         token = graph.one_of(joined, 0, 1)
         whole = graph.dense(graph("Concat", token, pooled, axis=-1), self._own["whole"]["up"])
         whole = graph.dense(graph("Gelu", whole), self._own["whole"]["down"])
-        return self._name_outputs(maps, whole)
+        return self._name_outputs(x, whole)
 
     def _sharp(self) -> str:
         """Return the finest features (B, H / 2, W / 2, C) of the last frame and its change."""
@@ -361,11 +370,40 @@ class _FieldGraph:
         up = graph.dense(graph("Gelu", deep), self._own["up"])
         return graph("Add", x, self._resized(up, quarter / eighth))
 
-    def _name_outputs(self, maps: str, whole: str) -> dict[str, tuple[int, ...]]:
-        """Name the outputs as `FieldOutput` does, and return their shapes."""
+    def _filled(self, slope: str, maps: str) -> str:
+        """Return the depth (B, h, w) whose gradient is `slope` (`fields.module._filled`)."""
         graph = self._graph
-        softened = graph("Softplus", graph.one_of(maps, 4, 3))
-        pressure = graph("Mul", softened, graph("Sigmoid", graph.one_of(maps, 3, 3)))
+        half = self._half
+        values, divergence, _ = transforms(half)
+        # Batches of matrices (B, h, w): rows are products from the left, columns from the right.
+        across = graph("MatMul", graph("MatMul", values, graph.one_of(slope, 0, 3)), divergence.T)
+        down = graph("MatMul", graph("MatMul", divergence, graph.one_of(slope, 1, 3)), values.T)
+        spectrum = graph("Mul", graph("Add", across, down), inverse_spectrum(half, half))
+        rise = graph("MatMul", graph("MatMul", values.T, spectrum), values)
+        touched = graph("Neg", graph.one_of(maps, 3, 3))
+        free = graph("Add", graph("Sigmoid", touched), TOUCHED_BORDER)
+        weight = graph("Mul", free, border(half, half))
+        missing = graph("Mul", weight, graph("Sub", graph.one_of(maps, 0, 3), rise))
+        total = graph("ReduceSum", missing, [1, 2], keepdims=1)
+        level = graph("Div", total, graph("ReduceSum", weight, [1, 2], keepdims=1))
+        return graph("Add", rise, level)
+
+    def _name_outputs(self, x: str, whole: str) -> dict[str, tuple[int, ...]]:
+        """Name the outputs as `FieldOutput` does, and return their shapes.
+
+        `x` are the finest features.
+        """
+        graph = self._graph
+        maps = graph.dense(x, self._own["maps"])
+        slope = self._convolved(x, "slope")
+        differences = graph("Mul", graph.part_of(slope, 0, 2, 3), DIFFERENCE)
+        depth = self._filled(differences, maps)
+        press = graph("Concat", x, graph("Unsqueeze", depth, [3]), axis=-1)
+        press = graph("Gelu", graph.dense(press, self._own["press"]["up"]))
+        press = graph.dense(press, self._own["press"]["down"])
+        contact = graph("Add", graph.one_of(maps, 3, 3), graph.one_of(press, 0, 3))
+        strength = graph("Add", graph.one_of(maps, 4, 3), graph.one_of(press, 1, 3))
+        pressure = graph("Mul", graph("Softplus", strength), graph("Sigmoid", contact))
         pressure = graph("Mul", pressure, STRESS)
         # The normal force is the integral of the pressure: there is none without contact.
         mean = graph("ReduceMean", pressure, [1, 2], keepdims=0)
@@ -373,9 +411,9 @@ class _FieldGraph:
         sideways = graph("Mul", graph.part_of(whole, 0, 2, 1), FORCE)
         # In the order of `FieldOutput`: a session takes outputs by their place.
         out = {
-            "depth": graph("Mul", graph.one_of(maps, 0, 3), LENGTH),
+            "depth": graph("Mul", depth, LENGTH),
             "shear": graph("Mul", graph.part_of(maps, 1, 3, 3), LENGTH),
-            "contact": graph.one_of(maps, 3, 3),
+            "contact": contact,
             "pressure": pressure,
             "depth_log": graph.one_of(maps, 5, 3),
             "shear_log": graph.one_of(maps, 6, 3),
@@ -401,6 +439,8 @@ class _FieldGraph:
         graph = self._graph
         part = self._own[name]
         inputs = 6  # of the first: a frame and its change, three colours each
+        if name == "slope":
+            inputs = len(self._own["maps"]["kernel"])
         if "norm" in part:
             x = graph("Gelu", graph.norm(x, part["norm"], self._model.norm_eps))
             inputs = len(part["norm"]["scale"])

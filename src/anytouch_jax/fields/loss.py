@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import jax
 import jax.numpy as jnp
 from jax import Array
 
 from anytouch_jax.batch import FieldBatch, FieldOutput
 from anytouch_jax.config import Config
-from anytouch_jax.fields.outputs import FORCE, LENGTH, STRESS, TORQUE
+from anytouch_jax.fields.module import FieldDecoder, SlopeOutput
+from anytouch_jax.fields.outputs import FORCE, LENGTH, STATES, STRESS, TORQUE
+from anytouch_jax.fields.poisson import differences
 from anytouch_jax.nn.functional import Net
 from anytouch_jax.objectives import (
     AnyBatch,
@@ -32,13 +36,21 @@ def field_terms(params: Params, batch: FieldBatch, *, net: Net) -> tuple[Array, 
     need"). `batch` has normalised pixels and drawn sensor rows.
     """
     batch = jax.tree.map(jnp.asarray, batch)
-    out: FieldOutput = net.measure(params, batch.clip, batch.sensor, batch.aspect)
+    network = net.bind(params)
+    states = network.touch.states(batch.clip, batch.sensor, STATES)
+    decoder = cast(FieldDecoder, network.fields)
+    out, slope = decoder.with_slope(states, batch.clip, batch.aspect)
+    return output_terms(out, slope, batch)
+
+
+def output_terms(out: FieldOutput, slope: SlopeOutput, batch: FieldBatch) -> tuple[Array, Metrics]:
+    """Return `field_terms` of the outputs for a batch."""
     touched = (batch.pressure > TOUCHED).astype(jnp.float32)
     pressed = (jnp.max(touched, (1, 2)) > 0).astype(jnp.float32)
     depth = (out.depth - batch.depth) / LENGTH
     # A press of half the force is as wrong as one of twice the force.
     ratio = jnp.log((out.force[:, 2] + LEAST_FORCE) / (batch.force[:, 2] + LEAST_FORCE))
-    terms = _map_terms(out, batch, touched, depth) | _whole_terms(out, batch, pressed, ratio)
+    terms = _map_terms(out, slope, batch, touched) | _whole_terms(out, batch, pressed, ratio)
     predicted = (out.contact > 0).astype(jnp.float32)
     both = jnp.sum(predicted * touched)
     either = jnp.sum(jnp.maximum(predicted, touched))
@@ -53,8 +65,9 @@ def field_terms(params: Params, batch: FieldBatch, *, net: Net) -> tuple[Array, 
     return jnp.sum(jnp.stack(list(terms.values()))), metrics
 
 
-def _map_terms(out: FieldOutput, batch: FieldBatch, touched: Array, depth: Array) -> Metrics:
-    """Return the terms of the maps (B, h, w). `depth` is its error over LENGTH."""
+def _map_terms(out: FieldOutput, slope: SlopeOutput, batch: FieldBatch, touched: Array) -> Metrics:
+    """Return the terms of the maps (B, h, w)."""
+    depth = (out.depth - batch.depth) / LENGTH
     ratio = losses.mean(touched)
     # Contact covers little of an image. Pixels in contact weigh as much as all others together, so
     # that zero everywhere is no good answer.
@@ -65,6 +78,7 @@ def _map_terms(out: FieldOutput, batch: FieldBatch, touched: Array, depth: Array
         return losses.mean(weight * values)
 
     shear = (out.shear - batch.shear) / LENGTH
+    own = slope.values - differences(batch.depth / LENGTH)
     slope_y = losses.mean(jnp.abs(jnp.diff(depth, axis=1)))
     slope_x = losses.mean(jnp.abs(jnp.diff(depth, axis=2)))
     shear_loss = losses.laplace_loss(shear, out.shear_log[..., None])
@@ -72,11 +86,18 @@ def _map_terms(out: FieldOutput, batch: FieldBatch, touched: Array, depth: Array
         "depth": over_pixels(losses.laplace_loss(depth, out.depth_log)),
         # An edge in the wrong place costs little in depth and much in slope.
         "slopes": slope_y + slope_x,
+        "slope": over_pixels(jnp.mean(losses.laplace_loss(own, slope.log), -1)),
         "shear": over_pixels(jnp.mean(shear_loss, -1)),
         # Unweighted, because the output is a probability.
         "contact": 2 * losses.mean(losses.binary_loss(out.contact, touched)),
-        "pressure": over_pixels(jnp.abs(out.pressure - batch.pressure) / STRESS),
+        # A few deep presses have a hundred times the pressure of others: high ones as a ratio.
+        "pressure": over_pixels(jnp.abs(_squeezed(out.pressure) - _squeezed(batch.pressure))),
     }
+
+
+def _squeezed(pressure: Array) -> Array:
+    """Return pressures over STRESS where they are small, and their logarithm where they are not."""
+    return jnp.log1p(pressure / STRESS)
 
 
 def _whole_terms(out: FieldOutput, batch: FieldBatch, pressed: Array, ratio: Array) -> Metrics:

@@ -6,6 +6,8 @@ So a network that was trained on sensors of any zoom reads one of any size.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 from flax import nnx
@@ -13,7 +15,17 @@ from jax import Array, lax
 from jax.typing import DTypeLike
 
 from anytouch_jax.config import ModelConfig
-from anytouch_jax.fields.outputs import FORCE, LENGTH, STATES, STRESS, TORQUE, FieldOutput
+from anytouch_jax.fields.outputs import (
+    DIFFERENCE,
+    FORCE,
+    LENGTH,
+    STATES,
+    STRESS,
+    TORQUE,
+    TOUCHED_BORDER,
+    FieldOutput,
+)
+from anytouch_jax.fields.poisson import border, integrate
 from anytouch_jax.nn.layers import Dense, LayerNorm, Mlp, gelu, product, stored, table
 
 
@@ -90,11 +102,23 @@ class Convolution(nnx.Module):
         return x + self.bias[...].astype(x.dtype)[None, None, None]
 
 
+class SlopeOutput(NamedTuple):
+    """Differences (B, h, w, 2) of the depth to the right neighbour and to the one below.
+
+    They are over LENGTH, and so are their deviations, whose logarithms are `log` (B, h, w, 2).
+    """
+
+    values: Array
+    log: Array
+
+
 class FieldDecoder(nnx.Module):
     """Patch tokens of several blocks, and a convolutional path from the pixels for sharp edges
     (after DPT).
 
-    A deeper path on a grid of an eighth sees how slopes add up over the contact (after U-Net).
+    A deeper path on a grid of an eighth sees how far the contact reaches (after U-Net). A camera
+    shows slopes. So the gradient of the depth is predicted and integrated (`fields.poisson`): a
+    depth that is predicted directly falls back to the mean inside a flat contact.
     """
 
     def __init__(self, model: ModelConfig) -> None:
@@ -118,12 +142,23 @@ class FieldDecoder(nnx.Module):
         self.fine1 = Convolution(many + few // 2, few, 3, model)
         self.fine2 = Convolution(few, few, 3, model)
         self.maps = Dense(few, 7, model)
+        self.slope = Convolution(few, 4, 3, model, norm=False)
+        self.press = Mlp(few + 1, few, model, gelu, outputs=2)
         self.whole = Mlp(width + many, 2 * many, model, gelu, outputs=8)
         self.special = 1 + model.sensor_tokens
         self.grid = model.image_size // model.patch
 
     def __call__(self, states: Array, clip: Array, aspect: Array) -> FieldOutput:
         """Return the fields of the last frame of clips.
+
+        See `with_slope`.
+        """
+        return self.with_slope(states, clip, aspect)[0]
+
+    def with_slope(
+        self, states: Array, clip: Array, aspect: Array
+    ) -> tuple[FieldOutput, SlopeOutput]:
+        """Return the fields of the last frame of clips, and the gradient that was integrated.
 
         `states` are (B, 1 + S + N, STATES * D), `clip` is normalised (B, T, H, W, 3), and `aspect`
         (B,) the logarithm of the height over the width that the image shows.
@@ -146,16 +181,23 @@ class FieldDecoder(nnx.Module):
         pooled = jnp.mean(x, (1, 2))
         x = self.fine1(jnp.concatenate([_resized(x, sharp), sharp], -1))
         x = x + self.fine2(x)
-        maps = self.maps(gelu(x)).astype(jnp.float32)
+        x = gelu(x)
+        maps = self.maps(x).astype(jnp.float32)
+        slope = self.slope(x).astype(jnp.float32)
+        differences = DIFFERENCE * slope[..., :2]
+        depth = _filled(differences, maps[..., 0], maps[..., 3])
+        # Pressure follows from the depth that is filled in.
+        press = self.press(jnp.concatenate([x, depth[..., None].astype(x.dtype)], -1))
+        contact = maps[..., 3] + press[..., 0].astype(jnp.float32)
+        strength = maps[..., 4] + press[..., 1].astype(jnp.float32)
         both = jnp.concatenate([states[:, 0], pooled.astype(states.dtype)], -1)
         whole = self.whole(both).astype(jnp.float32)
-        contact = maps[..., 3]
-        pressure = STRESS * jax.nn.softplus(maps[..., 4]) * jax.nn.sigmoid(contact)
+        pressure = STRESS * jax.nn.softplus(strength) * jax.nn.sigmoid(contact)
         # The normal force is the integral of the pressure: there is none without contact.
         normal = jnp.mean(pressure, (1, 2)) * jnp.exp(aspect)
         force = jnp.concatenate([FORCE * whole[:, :2], normal[:, None]], -1)
-        return FieldOutput(
-            depth=LENGTH * maps[..., 0],
+        out = FieldOutput(
+            depth=LENGTH * depth,
             shear=LENGTH * maps[..., 1:3],
             contact=contact,
             pressure=pressure,
@@ -168,6 +210,20 @@ class FieldDecoder(nnx.Module):
             torque_log=whole[:, 6],
             slip_log=whole[:, 7],
         )
+        return out, SlopeOutput(differences, slope[..., 2:])
+
+
+def _filled(slope: Array, level: Array, contact: Array) -> Array:
+    """Return the depth (B, h, w) whose gradient is `slope` (B, h, w, 2).
+
+    Its constant is that of `level` (B, h, w) at the border of the picture. Where nothing touches
+    there, by the logits `contact` (B, h, w), the level is known best, as it is close to 0.
+    """
+    rise = integrate(slope)
+    free = jax.nn.sigmoid(-lax.stop_gradient(contact)) + TOUCHED_BORDER
+    weight = free * border(*level.shape[1:])[None]
+    constant = jnp.sum(weight * (level - rise), (1, 2)) / jnp.sum(weight, (1, 2))
+    return rise + constant[:, None, None]
 
 
 def _resized(x: Array, other: Array) -> Array:

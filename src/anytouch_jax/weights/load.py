@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from anytouch_jax.config import SENSORS, Config, DataConfig, ModelConfig, from_json, parse_json
-from anytouch_jax.doors import WEIGHTS, enter
+from anytouch_jax.doors import HEADS, WEIGHTS, enter
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import read_arrays
 from anytouch_jax.weights import checkpoint, convert, registry, safetensors
@@ -26,7 +26,7 @@ from anytouch_jax.weights.convert import (
 )
 from anytouch_jax.weights.keymaps import Weights, param_shapes
 from anytouch_jax.weights.safetensors import Loaded, WeightsError
-from anytouch_jax.weights.tree import flatten
+from anytouch_jax.weights.tree import flatten, nest
 
 Params = dict[str, Any]
 
@@ -78,7 +78,9 @@ def load_model(
             for name, form in param_shapes(config.model).items()
             if name.split("/")[0] in params
         }
-        arrays = flatten(params)  # runs of version 0.1 have more
+        arrays = _completed(flatten(params))  # runs of version 0.1 have more
+        if "fields" in params:
+            params = nest(arrays)
         check_arrays(
             f"arrays of {path}", {name: x for name, x in arrays.items() if name in wanted}, wanted
         )
@@ -92,7 +94,7 @@ def load_model(
         file_metadata = safetensors.read_file_metadata(path)
         background: Any = file_metadata.get(safetensors.BACKGROUND_KEY, "keep")
         with _naming(path):
-            params = to_params(weights, model)
+            params = to_params(_completed(weights), model)
             config = Config(model, data=DataConfig(background=background))
         # A run without universal tokens was exported with the mean of its sensors in their place.
         trained = trained_sensors(file_metadata, model)
@@ -111,6 +113,14 @@ def load_model(
     return Loaded(
         path, params, config, None if trained is None else tuple(trained), drawn, metadata, from_run
     )
+
+
+def _completed(arrays: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the arrays with those that a decoder of fields of version 0.2 lacks."""
+    if not any(name.startswith("fields/") for name in arrays):
+        return dict(arrays)
+    completed: dict[str, Any] = enter(HEADS["fields older"])(arrays)
+    return completed
 
 
 @contextmanager

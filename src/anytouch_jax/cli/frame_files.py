@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from anytouch_jax.encoder.embed import NumberedFrame
 
 
-
 def some_frames(data: Path) -> Iterator[np.ndarray]:
     """Yield evenly spread frames of a folder, all frames of a video, or an image.
 

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
+from anytouch_jax.cli import frame_files
 from anytouch_jax.cli.arguments import DEFAULT
 from anytouch_jax.cli.heads import head_in_use
-from anytouch_jax.cli import frame_files
 from anytouch_jax.cli.output import log, refuse_join, refuse_unused
 from anytouch_jax.config import FIELD_SENSORS, UNIVERSAL, check_spelling
 from anytouch_jax.config.parsing import Count
@@ -334,8 +334,6 @@ def _recording_gel(
     return None, "not subtracted"
 
 
-
-
 def backgrounds_of(preprocess: Preprocess, options: SensorOptions) -> dict[str, np.ndarray]:
     """Return the untouched gel that was subtracted, upright, by the name of the sensor."""
     from anytouch_jax.data.background.rule import reduced
@@ -352,8 +350,6 @@ def log_universal(encoder: Encoder, options: SensorOptions) -> None:
     if options.sensor is None and len(encoder.config.model.sensors) > 1:
         names = ", ".join(name for name in encoder.config.model.sensors if name != UNIVERSAL)
         log(f"no --sensor was given, so the universal tokens were used. Known sensors: {names}.")
-
-
 
 
 def usable_rows(manifest: Manifest, rows: np.ndarray, frames: int) -> np.ndarray:
@@ -395,9 +391,3 @@ def contact_of_rows(
     ).score[rows]
     by_score = np.where(np.isnan(score), np.nan, score > limits)
     return np.where(np.isnan(known), by_score, known)
-
-
-
-
-
-

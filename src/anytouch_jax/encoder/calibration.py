@@ -229,9 +229,12 @@ def calibrate(
     # and Wasserman (2019): every class whose score is at most the limit.
     set_limit = conformal_limit(1 - p[np.arange(len(truth)), truth], held_out, coverage)
 
-    limits = {"temperature": temperature, "coverage": coverage, "set_limit": set_limit}
     return Calibration(
-        recordings=len(np.unique(held_out)), **limits, **known_touches(rows, x, false_alarms)
+        temperature=temperature,
+        recordings=len(np.unique(held_out)),
+        coverage=coverage,
+        set_limit=set_limit,
+        **known_touches(rows, x, false_alarms),
     )
 
 
@@ -251,9 +254,12 @@ def calibrate_number(
     """
     errors = np.abs(rows.logits[:, 0] - rows.y)
     half = conformal_limit(errors, rows.held_out, coverage)
-    limits = {"temperature": 1.0, "coverage": coverage, "set_limit": half}
     return Calibration(
-        recordings=len(np.unique(rows.held_out)), **limits, **known_touches(rows, x, false_alarms)
+        temperature=1.0,
+        recordings=len(np.unique(rows.held_out)),
+        coverage=coverage,
+        set_limit=half,
+        **known_touches(rows, x, false_alarms),
     )
 
 

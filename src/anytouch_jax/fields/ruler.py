@@ -31,8 +31,8 @@ from anytouch_jax.encoder.arrays import Array
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_write, check_array, read_arrays
 from anytouch_jax.sim.fitting.balls import (
-    pixel_grid,
     normals_of,
+    pixel_grid,
     place_balls,
     usual_strength,
 )

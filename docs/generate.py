@@ -34,6 +34,7 @@ _TITLES = {
     "nn": "Networks",
     "train": "Training",
     "training": "Training",
+    "finetuning": "Training",
     "batch": "Batches",
     "config": "Settings",
     "data": "Data",

@@ -121,7 +121,7 @@ def test_one_question_a_sequence_with_the_photograph_of_its_middle_frame(make, t
     # The images are of one colour that tells the row: rows 1, 4, 7 are the middle frames.
     seen = sorted(round(float(_decoded(_images(body)[0])[..., 0].mean())) for body in server.asked)
     assert np.abs(np.array(seen) - [2, 5, 8]).max() <= 1
-    assert "photograph" in _words(server.asked[0])
+    assert "RGB image" in _words(server.asked[0])
 
 
 def test_one_photograph_or_touch_by_two_sensors_is_asked_about_once_with_small_images(

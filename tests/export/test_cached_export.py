@@ -178,7 +178,7 @@ def test_an_export_that_differs_is_never_used_and_not_tried_again(tmp_path, monk
 def test_xla_computes_what_an_export_cannot(tmp_path, monkeypatch):
     path = weights(tmp_path / "w.safetensors")
     auto, live = (load_encoder(path, engine=engine) for engine in ("auto", "xla"))
-    for given in ({"pooling": "mean"}, {"join": "concat"}):
+    for given in ({"pooling": "mean"}, {"aggregation": "concat"}):
         np.testing.assert_array_equal(
             *(one.encode_touch(CLIPS, "digit", **given) for one in (auto, live))
         )

@@ -204,7 +204,7 @@ def test_an_address_is_a_camera_and_a_video_at_an_address_is_a_video(tmp_path):
         source, live = open_source(f"{address}/stream.mjpg", None, said.append)
         assert live and source.read()[1].shape == (48, 64, 3) and "64 x 48 pixels" in said[0]
         source.release()
-        source, live = open_source(f"{address}/film.avi")
+        source, live = open_source(f"{address}/video.avi")
         assert not live and source.read()[0]
         source.release()
     finally:

@@ -160,7 +160,7 @@ COMMANDS = {
     "sensor check": Command(
         "check:CheckOptions",
         "check:run",
-        "Compare the untouched gel of today with the stored one: what has changed?",
+        "Say what has changed since the stored image of the untouched gel.",
     ),
     "report": Command(
         "retrieve:ReportOptions",

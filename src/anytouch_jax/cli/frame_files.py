@@ -7,11 +7,11 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from anytouch_jax.cli.output import log
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from anytouch_jax.encoder.embed import NumberedFrame
 
 

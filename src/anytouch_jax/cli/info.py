@@ -184,11 +184,12 @@ def _lines(path: Path) -> list[str]:
 def _container(path: Path) -> list[str]:
     """Return lines about HDF5 or zarr, whose cameras --keys chooses, [] for anything else."""
     from anytouch_jax.data import containers
-    from anytouch_jax.datasets.readers.containers import describe_container
 
     kind = containers.kind_of(path)
     if kind not in ("hdf5", "zarr"):
         return []
+    from anytouch_jax.datasets.readers.containers import describe_container
+
     with containers.open_container(path) as container:
         lines = describe_container(container)
     command = f"anytouch data index {kind} {path} --sensor NAME --keys KEY"

@@ -29,7 +29,6 @@ from anytouch_jax.fields.outputs import (
     TOUCHED_BORDER,
 )
 from anytouch_jax.fields.poisson import border, inverse_spectrum, transforms
-from anytouch_jax.nn.sight import BLOCKS, MIDDLE, RANGE, READ
 
 OPSET = 20  # the first with Gelu
 BLOCK = "block"  # start of the names of nodes in blocks
@@ -258,6 +257,9 @@ def _block(graph: Graph, x: str, block: Any, model: ModelConfig, *, first: bool)
 
 def _sight(graph: Graph, own: Any, frames: int) -> str:
     """Return the values (B, model.sight) of the trunk (`nn.sight.Sight`) for the last frame."""
+    # Here, because an artefact is loaded without the code of the network.
+    from anytouch_jax.nn.sight import BLOCKS, MIDDLE, RANGE, READ
+
     graph.part = "sight."
     x = graph("Cast", graph.one_of("frames", frames - 1, 1), to=_FLOAT32)
     x = graph("Div", graph("Sub", x, float(MIDDLE)), float(RANGE))

@@ -174,10 +174,10 @@ def test_a_stopped_camera_does_not_stop_the_page(encoder, video, tmp_path):
     open_streams = set()
     plain = live.packets
 
-    async def counted(layer):
+    async def counted(layer, side):
         open_streams.add(me := object())
         try:
-            async for packet in plain(layer):
+            async for packet in plain(layer, side):
                 yield packet
         finally:
             open_streams.discard(me)

@@ -30,7 +30,7 @@ from experiments.records import write_record
 RESULTS = Path(__file__).parents[1] / "results" / "mujoco_tasks.jsonl"
 KINDS = ("blind", "touch", "shuffled", "oracle")
 AT_ONCE = 24  # episodes side by side
-PARTS = 32  # principal components of the features
+PARTS = 64  # principal components of the features
 Act = Callable[[Array, Array], Array]  # state (n, p) and features (n, E) to actions (n,)
 
 
@@ -40,7 +40,7 @@ class Options:
 
     tasks: tyro.conf.Positional[tuple[Literal["hold", "align"], ...]] = ("hold", "align")
     seeds: int = 3
-    readings: int = 1920  # of all demonstrations of a seed
+    readings: int = 3840  # of all demonstrations of a seed
     episodes: int = 48  # of the test
     model: str = "anytouch-tiny"
     out: Path = RESULTS
@@ -62,7 +62,7 @@ class Eye:
         """Return features (n, E) of what the pads feel now."""
         reading = self._touch.read(episodes.datas)
         frames = [self._encoder.preprocess(one, self._touch.background) for one in reading.image]
-        encoded: Array = np.asarray(self._encoder.encode_touch(np.stack(frames), SENSOR))
+        encoded: Array = self._encoder.encode_touch(np.stack(frames), SENSOR, pooling="both")
         return encoded
 
 

@@ -13,8 +13,8 @@ from anytouch_jax.encoder.arrays import Array, Log
 from anytouch_jax.encoder.base import Encoder
 from anytouch_jax.encoder.linear_head import Head
 from anytouch_jax.finetuning import heads, start, training
+from anytouch_jax.finetuning.images import Touches
 from anytouch_jax.finetuning.options import FinetuneOptions, State, Watch
-from anytouch_jax.finetuning.pictures import Touches
 from anytouch_jax.finetuning.rows import Chosen
 
 # Of the time that features took at first: they are computed again at the end.

@@ -15,8 +15,8 @@ from anytouch_jax.encoder.linear_head import Head
 from anytouch_jax.errors import UserError, refuse_forked
 from anytouch_jax.finetuning import folder, report
 from anytouch_jax.finetuning.beat import Clock, head_of, tune
+from anytouch_jax.finetuning.images import read_touches, trainable
 from anytouch_jax.finetuning.options import FinetuneOptions, Watch
-from anytouch_jax.finetuning.pictures import read_touches, trainable
 from anytouch_jax.finetuning.rows import choose_rows
 from anytouch_jax.shown import shown_short
 

@@ -15,8 +15,8 @@ import numpy as np
 from anytouch_jax.encoder.arrays import Array, Params, run_in_batches
 from anytouch_jax.encoder.base import Encoder
 from anytouch_jax.errors import UserError
+from anytouch_jax.finetuning.images import Touches, changed
 from anytouch_jax.finetuning.options import FinetuneOptions
-from anytouch_jax.finetuning.pictures import Touches, changed
 from anytouch_jax.finetuning.rates import HEAD, depth_factor, steadiness, trunk_depths
 from anytouch_jax.finetuning.start import Held, Linear, Parts, Target, held_score
 from anytouch_jax.train.loop import Work

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from tiny_models import touch_model
 
-from anytouch_jax.finetuning import pictures, rates
+from anytouch_jax.finetuning import images, rates
 from anytouch_jax.finetuning.options import Recipe
 from anytouch_jax.nn.functional import build
 from anytouch_jax.weights.tree import flatten
 
-changed = jax.jit(pictures.changed)
+changed = jax.jit(images.changed)
 
 
 def clips():
@@ -21,8 +21,8 @@ def clips():
 
 def test_without_strength_nothing_changes(monkeypatch):
     for name in ("SHIFT", "ZOOM", "GAIN"):
-        monkeypatch.setattr(pictures, name, 0.0)
-    same = jax.jit(lambda key, clip: pictures.changed(key, clip))(jax.random.key(0), clips())
+        monkeypatch.setattr(images, name, 0.0)
+    same = jax.jit(lambda key, clip: images.changed(key, clip))(jax.random.key(0), clips())
     np.testing.assert_allclose(same, clips(), atol=1e-3)
 
 

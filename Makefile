@@ -150,7 +150,7 @@ weights: $(STAMP) ## train an encoder on endless touches for a time, and go on l
 figures: $(STAMP) ## after new weights: measure the shipped encoder, then the results, images, notebooks and pages that show it: [TOUCH=manifest of real touch]
 	$(PY) -m experiments.real.run anytouch-tiny untrained:anytouch-tiny$(if $(TOUCH), --data $(TOUCH))
 	$(PY) -m experiments.real.run anytouch-tiny --untouched median$(if $(TOUCH), --data $(TOUCH))
-	$(PY) -m experiments.encoders.picture docs/pictures/first_touch.png
+	$(PY) -m experiments.encoders.image docs/pictures/first_touch.png
 	$(PY) -m experiments.encoders.animation docs/pictures/press.webp
 	$(PY) -m experiments.pages
 	$(PY) -m experiments.notebooks.execute 01 02 03

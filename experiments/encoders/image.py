@@ -1,6 +1,6 @@
 """The image of the README: the example touches, and how alike their features are.
 
-python -m experiments.encoders.picture docs/pictures/first_touch.png
+python -m experiments.encoders.image docs/pictures/first_touch.png
 """
 
 from __future__ import annotations

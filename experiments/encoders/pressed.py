@@ -1,6 +1,6 @@
 """Height maps of what people press: studs, nuts, keys, coins, threads, cloth, stairs, small balls.
 
-The objects of `sim.world` are balls, rods and textures: few of them are flat inside of the picture,
+The objects of `sim.world` are balls, rods and textures: few of them are flat inside of the image,
 and none is smaller than 4 mm. These are for training the decoder of fields alone, beside those. A
 map is (RELIEF, RELIEF) mm with `SPACING` mm between pixels and its highest place at 0. Like real
 parts none has a quite sharp edge.
@@ -197,7 +197,7 @@ def blobs(rng: Rng) -> Map:
 
 
 def ball(rng: Rng) -> Map:
-    """One ball of 2 to 12 mm diameter, which may leave the picture."""
+    """One ball of 2 to 12 mm diameter, which may leave the image."""
     x, y = _places(rng, rng.choice([1.0, 6.0]))
     radius = math.exp(rng.uniform(math.log(1.3), math.log(6.0)))
     return np.float32(np.sqrt(np.clip(radius**2 - x**2 - y**2, 0, None)) - radius)

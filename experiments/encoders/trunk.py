@@ -68,7 +68,7 @@ def real_touches(path: Path) -> RealTouches:
     first "_".
     """
     manifest = manifests.read(path)
-    gel_of = Backgrounds(manifest).shared(lambda picture: picture)
+    gel_of = Backgrounds(manifest).shared(lambda image: image)
     images = []
     kept = []
     for row in manifest.rows_of("train"):

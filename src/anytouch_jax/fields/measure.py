@@ -232,7 +232,7 @@ def _contact_of(
     Args:
         contact: (B, h, w), its probability.
         pressure: (B, h, w).
-        mm: width of the picture.
+        mm: width of the image.
         shape: its height over its width.
     """
     rows, columns = contact.shape[1:]

@@ -216,7 +216,7 @@ class FieldDecoder(nnx.Module):
 def _filled(slope: Array, level: Array, contact: Array) -> Array:
     """Return the depth (B, h, w) whose gradient is `slope` (B, h, w, 2).
 
-    Its constant is that of `level` (B, h, w) at the border of the picture. Where nothing touches
+    Its constant is that of `level` (B, h, w) at the border of the image. Where nothing touches
     there, by the logits `contact` (B, h, w), the level is known best, as it is close to 0.
     """
     rise = integrate(slope)

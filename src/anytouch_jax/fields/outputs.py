@@ -15,7 +15,7 @@ STRESS = 0.02
 FORCE = 0.01
 TORQUE = 0.002
 # Over LENGTH: what the last layer says of a difference between neighbours. Errors of differences
-# add up over the picture, so its weights may only move slowly.
+# add up over the image, so its weights may only move slowly.
 DIFFERENCE = 0.1
 # What a border pixel in contact weighs in the level of the depth, over one without contact.
 TOUCHED_BORDER = 0.02

@@ -69,7 +69,7 @@ def integrate(gradient: Array) -> Array:
 
 @lru_cache(maxsize=8)
 def border(rows: int, columns: int) -> Matrix:
-    """Return 1 for the pixels (rows, columns) at the border of a picture, and 0 within."""
+    """Return 1 for the pixels (rows, columns) at the border of an image, and 0 within."""
     ring = np.ones((rows, columns), np.float32)
     ring[1:-1, 1:-1] = 0
     return ring

@@ -100,7 +100,7 @@ def changed(key: jax.Array, clip: jax.Array) -> jax.Array:
     """Return clips shifted, zoomed and with another contrast and tint, f32 in 0..255.
 
     Touches are neither turned nor mirrored: the lights of a sensor stay where they are, so that a
-    turned picture shows a surface that its gel cannot have. All frames of a clip change alike.
+    turned image shows a surface that its gel cannot have. All frames of a clip change alike.
 
     Args:
         key: draws the changes.

@@ -1,7 +1,7 @@
 """EfficientNet-lite of ImageNet, without its classifier: what a user would take off the shelf.
 
 Its middle blocks are read, as they are more use for touch than its head, which knows kinds of
-things. A touch becomes a picture of what changed, in which the network finds edges and textures.
+things. A touch becomes an image of what changed, in which the network finds edges and textures.
 
 Tan and Le, "EfficientNet: Rethinking model scaling for convolutional neural networks" (2019). The
 lite form has neither squeeze-and-excitation nor swish, and ReLU6 in their place.
@@ -52,7 +52,7 @@ class ConvModel:
 class ConvEncoder(Encoder):
     """An EfficientNet-lite under the interface of `Encoder`.
 
-    Features are the means over the picture of the last blocks of four stages, whatever the
+    Features are the means over the image of the last blocks of four stages, whatever the
     pooling. Frames of a clip are averaged.
     """
 
@@ -108,25 +108,25 @@ class ConvEncoder(Encoder):
 
         def features(params: Params, clips: jax.Array, rows: jax.Array) -> jax.Array:
             count, frames = clips.shape[:2]
-            pictures = clips.reshape(count * frames, *clips.shape[2:])
-            means = run_network(params, pictures, self.form.strides, self.form.read)
+            images = clips.reshape(count * frames, *clips.shape[2:])
+            means = run_network(params, images, self.form.strides, self.form.read)
             return means.reshape(count, frames, -1).mean(1)
 
         return features
 
 
 def run_network(
-    params: Params, pictures: jax.Array, strides: tuple[int, ...], read: tuple[int, ...]
+    params: Params, images: jax.Array, strides: tuple[int, ...], read: tuple[int, ...]
 ) -> jax.Array:
     """Return the means f32 (B, E) of the outputs of some blocks.
 
     Args:
         params: "stem" and "block0", "block1" and so on, each convolution with kernel and bias.
-        pictures: (B, H, W, 3) in 0..255.
+        images: (B, H, W, 3) in 0..255.
         strides: of each block.
         read: numbers of the blocks whose means are returned, joined.
     """
-    x = (pictures.astype(jnp.float32) - _MIDDLE) / _RANGE
+    x = (images.astype(jnp.float32) - _MIDDLE) / _RANGE
     stem = params["stem"]
     x = jax.lax.conv_general_dilated(
         x, stem["kernel"], (2, 2), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC")
@@ -168,7 +168,7 @@ def _depthwise(params: Params, x: jax.Array, stride: int) -> jax.Array:
         total = max((out - 1) * stride + size - side, 0)
         pads.append((total // 2, total - total // 2))
     x = jnp.pad(x, ((0, 0), *pads, (0, 0)))
-    # A sum of shifted pictures: XLA's grouped convolution takes several times as long on a CPU.
+    # A sum of shifted images: XLA's grouped convolution takes several times as long on a CPU.
     total_sum: jax.Array = _wide(params["bias"])
     for down in range(size):
         for right in range(size):
@@ -179,7 +179,7 @@ def _depthwise(params: Params, x: jax.Array, stride: int) -> jax.Array:
 
 
 def _wide(values: jax.Array) -> jax.Array:
-    """Return values of each channel (C,) with the axes of pictures."""
+    """Return values of each channel (C,) with the axes of images."""
     return jnp.asarray(values)[None, None, None]
 
 
@@ -198,7 +198,7 @@ def read_efficientnet(path: Path, weights: Mapping[str, Array], side: int | None
     Args:
         path: the file, for sentences.
         weights: its arrays.
-        side: of its pictures, pixels. None is SIDE.
+        side: of its images, pixels. None is SIDE.
 
     Raises:
         WeightsError: another form than the lite one, or a damaged file.

@@ -120,12 +120,12 @@ def load_family(
 
 
 def _side(image_size: Any) -> int | None:
-    """Return the side of square pictures. Raises WeightsError for others."""
+    """Return the side of square images. Raises WeightsError for others."""
     if image_size is None or isinstance(image_size, int):
         return image_size
     high, wide = image_size
     if high != wide:
-        raise WeightsError("an EfficientNet takes square pictures here; give one side")
+        raise WeightsError("an EfficientNet takes square images here; give one side")
     return int(high)
 
 

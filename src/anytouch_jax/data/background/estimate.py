@@ -35,7 +35,7 @@ DIFFERENT = 6.5
 # least excess of structure, as a fraction of the sum; measured on real and simulated recordings
 MARGIN = 0.1
 
-# of the largest part of contact, and of the picture: less than that is noise
+# of the largest part of contact, and of the image: less than that is noise
 _ISLAND = 0.1
 _SPECK = 2e-4
 _TAKEN = 0.95  # fraction of a change that takes edges away, see `holds_press`

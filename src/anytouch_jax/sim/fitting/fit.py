@@ -300,7 +300,7 @@ def colour_changes(
     A change of the light, which is a plane for each colour, is removed, and so are the dots.
 
     Args:
-        frames: N pictures RGB u8 (h, w, 3).
+        frames: N images RGB u8 (h, w, 3).
         gel: the untouched gel, of the same size.
         dots: those of the gel.
         long_side: pixels H or W of the result.

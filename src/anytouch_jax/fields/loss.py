@@ -27,6 +27,10 @@ from anytouch_jax.ops import losses
 TOUCHED = 1e-3  # of the gel's modulus: a pressure that counts as contact
 # Of modulus times width squared, some 0.05 N: smaller forces have no meaningful ratio.
 LEAST_FORCE = 1e-3
+# Weights of the squared errors of the slope and of the depth, over LENGTH.
+SQUARED_SLOPE = 10.0
+SQUARED_DEPTH = 4.0
+FAR = 2.0  # from this error of the depth on, over LENGTH, its square becomes a line
 
 
 def field_terms(params: Params, batch: FieldBatch, *, net: Net) -> tuple[Array, Metrics]:
@@ -82,17 +86,29 @@ def _map_terms(out: FieldOutput, slope: SlopeOutput, batch: FieldBatch, touched:
     slope_y = losses.mean(jnp.abs(jnp.diff(depth, axis=1)))
     slope_x = losses.mean(jnp.abs(jnp.diff(depth, axis=2)))
     shear_loss = losses.laplace_loss(shear, out.shear_log[..., None])
+    # The likelihood of Laplace errors asks for the median, and hardly weighs places whose deviation
+    # is large, such as the flanks of a flat top. Both read it too shallow. A squared error asks for
+    # the mean, and means of slopes add up to the mean of the depth.
+    steep = jnp.mean(jnp.square(own), -1)
     return {
         "depth": over_pixels(losses.laplace_loss(depth, out.depth_log)),
         # An edge in the wrong place costs little in depth and much in slope.
         "slopes": slope_y + slope_x,
         "slope": over_pixels(jnp.mean(losses.laplace_loss(own, slope.log), -1)),
+        "squared_slope": SQUARED_SLOPE * over_pixels(steep),
+        "squared_depth": SQUARED_DEPTH * over_pixels(_squared(depth)),
         "shear": over_pixels(jnp.mean(shear_loss, -1)),
         # Unweighted, because the output is a probability.
         "contact": 2 * losses.mean(losses.binary_loss(out.contact, touched)),
         # A few deep presses have a hundred times the pressure of others: high ones as a ratio.
         "pressure": over_pixels(jnp.abs(_squeezed(out.pressure) - _squeezed(batch.pressure))),
     }
+
+
+def _squared(error: Array) -> Array:
+    """Return squared errors that are lines from FAR on (Huber), so that no press takes a batch."""
+    near = jnp.minimum(jnp.abs(error), FAR)
+    return near * (2 * jnp.abs(error) - near)
 
 
 def _squeezed(pressure: Array) -> Array:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from ball_presses import DIAMETER, POSES, WIDTH, presses
 from measuring import measuring_weights
+from videos import write_video
 
 from anytouch_jax.cli.app import main
 from anytouch_jax.encoder.encoder import load_encoder
@@ -58,6 +59,22 @@ def test_a_ball_and_a_weight_make_a_sensor_that_measure_takes(place, capsys, mon
     assert fields.case == "calibrated" and fields.width_mm == WIDTH
     # Depth is by the colours: the weights are random, and know nothing of it.
     assert fields.depth.max() == pytest.approx(presses().depth[2].max(), rel=0.35)
+
+
+def test_a_stream_takes_a_calibrated_sensor(place, capsys, monkeypatch):
+    monkeypatch.chdir(place)
+    assert calibrate(*BALL, "--out", "live.sensor") == 0
+    assert calibrate("--sensor", "live.sensor", "--newton", "5") == 0
+    capsys.readouterr()
+    write_video("balls.avi", presses().frames[..., ::-1], code="FFV1")
+    words = ["stream", "--model", "weights.safetensors", "--data", "balls.avi", "--out", "-"]
+    words += ["--background", "balls/background.png", "--fields", "--sensor", "live.sensor"]
+    assert main(words) == 0
+    lines = [json.loads(line)["fields"] for line in capsys.readouterr().out.splitlines()]
+    forces = [line["force_z"] for line in lines]
+    assert np.median(forces) == pytest.approx(5, rel=0.3)
+    for line in lines:
+        assert line["force_low"] < line["force_z"] < line["force_high"]
 
 
 def test_forces_come_from_a_column_too(place, capsys, monkeypatch):

@@ -30,7 +30,7 @@ function showLive(source, about) {
   const facts = el("div", { className: "facts" }), near = el("div", { className: "thumbs" }), nearest = el("div", { className: "thumbs" });
   const force = forceBar(), pictures = about.table === null ? null : framesOf(about.table, "frame", true);
   const ages = [], scores = {}, boxes = {}, view = { rotate: 0, flip: "none" };
-  let drawnAt = 0, toldAt = 0, stopped = new AbortController(), shownNear = "", done = null, recording = false, pressed = 0, taught = -1, trained = false, orders = Promise.resolve();
+  let drawnAt = 0, toldAt = 0, stopped = new AbortController(), shownNear = "", done = null, recording = false, asked = "", pressed = 0, taught = -1, learning = false, listed = "", trained = false, orders = Promise.resolve();
   let recorded = new Pictures(`${source}/recorded`, "frame", true);
   const fact = (name, value, kind = "") => {
     boxes[name] ??= facts.appendChild(el("div", { className: "fact" }, name, el("b")));
@@ -38,19 +38,22 @@ function showLive(source, about) {
     boxes[name].className = `fact ${kind}`;
   };
   // Orders go one after the other: a recording begins before it ends.
-  const send = (body, more) => (orders = orders.then(() => { say(""); return order(source, body, more); }).catch((error) => say(error.message, true)));
+  const send = (body, more) => (orders = orders.then(() => { say(""); return order(source, body, more); }).catch((error) => { say(error.message, true); }));
   const turn = () => send({ do: "orient", rotate: Number(view.rotate), flip: view.flip });
 
   // Teach: hold the button to record, or press it shortly to record until the next press.
   const known = el("datalist", { id: "known-names" });
   const object = el("input", { list: known.id, maxLength: 100, autocomplete: "off", placeholder: "cup" });
   const record = el("button", { className: "main record" }, "Hold to record");
+  // Frames that are under way still tell of the recording before. Until one shows what was ordered, the order counts.
+  const isOn = () => (asked ? asked === "record" : recording);
+  const direct = (body) => { asked = body.do; send(body).then((done) => { if (!done) asked = ""; }); };
   const begin = () => {
-    if (recording || pressed) { end(); return; }
+    if (isOn() || pressed) { end(); return; }
     pressed = performance.now();
-    send({ do: "record", object: object.value });
+    direct({ do: "record", object: object.value });
   };
-  const end = () => { pressed = 0; send({ do: "stop" }); };
+  const end = () => { pressed = 0; direct({ do: "stop" }); };
   const release = () => { if (pressed && performance.now() - pressed > HELD) end(); else pressed = 0; };
   const hold = (event) => [" ", "Enter"].includes(event.key) && (event.preventDefault(), true);
   record.addEventListener("pointerdown", (event) => { if (event.button === 0) { record.setPointerCapture(event.pointerId); begin(); } });
@@ -73,10 +76,8 @@ function showLive(source, about) {
   });
   const downloads = el("div", { className: "bar" }, el("button", { onclick: save("head.npz") }, "Download head"),
     el("button", { onclick: save("recordings.zip") }, "Download recordings"));
-  const learn = guard(async () => {
-    const found = await json(`${source}/taught`), several = Object.entries(found.names);
+  const listNames = (several) => {
     recorded = new Pictures(`${source}/recorded`, "frame", true);
-    trained = found.trained;
     known.replaceChildren(...several.map(([name]) => el("option", { value: name })));
     names.replaceChildren(...several.map(([name, one]) => {
       const count = `${one.recordings} ${one.recordings === 1 ? "recording" : "recordings"}`;
@@ -84,6 +85,12 @@ function showLive(source, about) {
         el("button", { className: "quiet small", title: "Its frames stay on the disk.", ariaLabel: `Leave out last recording of ${name}`,
           onclick: () => send({ do: "leave out", sequence: one.last }) }, "Leave out last"));
     }));
+  };
+  const learn = async () => {
+    const found = await json(`${source}/taught`), several = Object.entries(found.names);
+    trained = found.trained;
+    // The list stays while it is the same: a button that is replaced under a finger cannot be pressed.
+    if (listed !== JSON.stringify(several)) { listed = JSON.stringify(several); listNames(several); }
     train.disabled = found.training || Boolean(found.missing);
     train.className = several.length > 1 && !found.trained ? "main" : "";
     train.textContent = found.training ? (found.trained && found.result.right === undefined ? "Measuring …" : "Training …") : found.trained ? "Train again" : "Train";
@@ -95,6 +102,7 @@ function showLive(source, about) {
     longer.title = "Trains the encoder too, on all recordings. Some are held out, and it never ends below the head.";
     train.disabled ||= more.on;
     course.className = more.fault ? "alarm" : "soft";
+    course.ariaLive = more.on ? "off" : "polite"; // a screen reader would read each second
     course.textContent = more.on ? `Training the encoder: ${clock(more.left)} left${more.score ? `. On held-out recordings: ${more.score}, the head alone: ${more.before}.` : ""}` : more.fault || more.said;
     missing.className = found.fault ? "alarm" : "soft";
     missing.textContent = found.fault || (several.length ? found.missing : "Type a name, hold the button, and touch. Touch it again for a second recording. Then teach another name.");
@@ -103,6 +111,18 @@ function showLive(source, about) {
     const by = more.used ? `--model ${more.folder}` : `--head ${found.file}`;
     const use = `anytouch stream --data ${/^\d+$/.test(about.source) ? about.source : "0"} ${about.sensor ? `--sensor ${about.sensor} ` : ""}${by} --out -`;
     result.replaceChildren(...(found.trained ? [...verdict(found.result), el("p", { className: "soft small" }, "Use it in a robot:"), el("code", {}, use)] : []));
+  };
+  // One question at a time: on a busy machine, an answer could come after that of a later question and stay.
+  const learnOnce = guard(async (version) => {
+    if (learning) return;
+    learning = true;
+    try {
+      await learn();
+      taught = version;
+    } catch (error) {
+      await new Promise((go) => setTimeout(go, 1000)); // then the next frame asks again
+      throw error;
+    } finally { learning = false; }
   });
 
   const curve = (name, value, level) => {
@@ -164,8 +184,9 @@ function showLive(source, about) {
     if (ages.length > 600) ages.shift();
     const draws = Object.entries(curvesOf(one)).map(([name, value]) => curve(name, value, name === CONTACT ? inPercent(one.threshold) : null));
     main.dataset.frames = Number(main.dataset.frames ?? 0) + 1;
-    if (one.taught !== taught) { taught = one.taught; learn(); }
+    if (one.taught !== taught) learnOnce(one.taught);
     recording = one.recording.on;
+    if (asked && recording === (asked === "record")) asked = "";
     const now = performance.now();
     if (now - drawnAt > CURVES) {
       drawnAt = now;

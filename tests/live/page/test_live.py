@@ -28,6 +28,7 @@ from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.live.page import live as live_module
+from anytouch_jax.live.page import packet as packet_module
 from anytouch_jax.live.page import server
 from anytouch_jax.live.page.feature_map import FeatureMap
 from anytouch_jax.live.page.live import Live
@@ -157,6 +158,10 @@ def test_live_touch_is_measured(encoder, tmp_path, monkeypatch):
                 and pressed["fields"]["force"][2] > 0.1 > free["fields"]["force"][2]
             )
             assert {"contact", "force, N", "depth, mm", "slip, %"} == set(pressed["curves"])
+            # The frame was compared with its background before.
+            with monkeypatch.context() as patch:
+                patch.delattr(packet_module, "touch_layer")
+                assert opened(packet_module.packet(live._newest, layer))[0]["layer"] == layer
         # no frame is read in one way and measured in another
         for rotate in (90, 0) * 40:
             live.frames.orient(rotate, "none")

@@ -2,6 +2,7 @@
 // Live touch, and a classifier that is taught by touching.
 
 const KEPT_LIVE = 300, HELD = 400; // points of a live curve, ms from which a pressed button was held
+const KEPT_AGES = 600; // frames whose ages make p50 and p99
 const CURVES = 100, WORDS = 300; // ms between drawings of the curves, and between changes of words, which people read
 
 const percent = (share) => `${Math.round(100 * share)} %`;
@@ -29,7 +30,7 @@ function showLive(source, about) {
   const felt = el("h2", { className: "felt" }), sure = el("div", { className: "bars small" }), why = el("p", { className: "soft" });
   const facts = el("div", { className: "facts" }), near = el("div", { className: "thumbs" }), nearest = el("div", { className: "thumbs" });
   const force = forceBar(), pictures = about.table === null ? null : framesOf(about.table, "frame", true);
-  const ages = [], scores = {}, boxes = {}, view = { rotate: 0, flip: "none" };
+  const ages = [], parts = [], scores = {}, boxes = {}, view = { rotate: 0, flip: "none" };
   let drawnAt = 0, toldAt = 0, stopped = new AbortController(), shownNear = "", done = null, recording = false, asked = "", pressed = 0, taught = -1, learning = false, listed = "", trained = false, orders = Promise.resolve();
   let recorded = new Pictures(`${source}/recorded`, "frame", true);
   const fact = (name, value, kind = "") => {
@@ -174,14 +175,15 @@ function showLive(source, about) {
     else if (one.set.length > 1) why.textContent = `It may be ${one.set.slice(0, 4).join(", ")}.`;
   };
   const percentile = (values, share) => [...values].sort((a, b) => a - b)[Math.floor(share * (values.length - 1))] ?? 0;
-  const show = async (one, jpeg) => {
+  const show = async (one, jpeg, arrived) => {
     if (one.error) { say(one.error, true); return; }
     const bitmap = await createImageBitmap(new Blob([jpeg], { type: "image/jpeg" }));
     showLayer(canvas, bitmap, one.layer === "surface" ? one.fields : null);
     bitmap.close();
-    const age = performance.timeOrigin + performance.now() - one.grabbed;
-    ages.push(age);
-    if (ages.length > 600) ages.shift();
+    const drawn = performance.timeOrigin + performance.now();
+    ages.push(drawn - one.grabbed);
+    parts.push([one.sent - one.grabbed, arrived - one.sent, drawn - arrived]); // to its packet, to the page, to the canvas
+    for (const list of [ages, parts]) if (list.length > KEPT_AGES) list.shift();
     const draws = Object.entries(curvesOf(one)).map(([name, value]) => curve(name, value, name === CONTACT ? inPercent(one.threshold) : null));
     main.dataset.frames = Number(main.dataset.frames ?? 0) + 1;
     if (one.taught !== taught) learnOnce(one.taught);
@@ -195,6 +197,7 @@ function showLive(source, about) {
     if (now - toldAt < WORDS) return;
     toldAt = now;
     main.dataset.ages = JSON.stringify([percentile(ages, 0.5), percentile(ages, 0.99), Math.max(...ages)].map(Math.round));
+    main.dataset.parts = JSON.stringify([0, 1, 2].map((i) => Number(percentile(parts.map((each) => each[i]), 0.5).toFixed(1))));
     feel(one);
     force.show(one.fields, one.layer);
     hidden.hidden = one.layer === state.layer;
@@ -242,7 +245,7 @@ function showLive(source, about) {
         const view = new DataView(data.buffer, data.byteOffset, data.length);
         const text = data.length >= 4 ? view.getUint32(0, true) : 0, end = data.length >= 8 + text ? view.getUint32(4 + text, true) : 0;
         if (data.length < 8 + text || data.length < 8 + text + end || data.length < 8) break;
-        newest = [JSON.parse(new TextDecoder().decode(data.subarray(4, 4 + text))), data.slice(8 + text, 8 + text + end)];
+        newest = [JSON.parse(new TextDecoder().decode(data.subarray(4, 4 + text))), data.slice(8 + text, 8 + text + end), performance.timeOrigin + performance.now()];
         data = data.slice(8 + text + end);
       }
       if (newest && !drawing) draw();

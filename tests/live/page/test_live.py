@@ -33,6 +33,7 @@ from anytouch_jax.live.page import server
 from anytouch_jax.live.page.feature_map import FeatureMap
 from anytouch_jax.live.page.live import Live
 from anytouch_jax.live.page.recorder import SCORE, LiveRecorder
+from anytouch_jax.live.page.setup import make_setup
 
 PAGE = {"X-Anytouch": "1"}
 # image, contact score and features
@@ -172,6 +173,40 @@ def test_live_touch_is_measured(encoder, tmp_path, monkeypatch):
     finally:
         live.stop()
         runner.close()
+
+
+def test_a_background_that_does_not_fit_the_calibration_is_said(encoder):
+    """Of another gel deviations are wider, of another device nothing is measured."""
+    gel = np.full((48, 64, 3), 128, np.uint8)
+
+    class Measuring:
+        """The encoder, with a calibrated sensor."""
+
+        measures = True
+
+        def __getattr__(self, name: str):
+            return getattr(encoder, name)
+
+        def measure_of(self, sensor, background, log):
+            if sensor == "other":
+                raise UserError("another device.")
+            if sensor == "worn":
+                log("another gel: deviations are wider.")
+            return log
+
+    notes = {}
+    logged = []
+    for sensor in ("same", "worn", "other"):
+        setup = make_setup(Measuring(), sensor, 0, "none", gel, log=logged.append)
+        if setup.measure is not None:
+            setup.measure("do not trust this frame")
+        notes[sensor] = (setup.note, setup.measure is not None)
+    assert notes == {
+        "same": ("", True),
+        "worn": ("another gel: deviations are wider.", True),
+        "other": ("another device.", False),
+    }
+    assert logged == ["another gel: deviations are wider.", "another device."]
 
 
 def test_a_stopped_camera_does_not_stop_the_page(encoder, video, tmp_path):

@@ -2,13 +2,13 @@
 // What was measured: the surface of the gel, which can be turned, and force and depth as a bar and in words.
 
 const VIEW = [640, 440]; // pixels of the view
-const LIFT = 0.25, EDGE = 3; // height of a whole scale, in widths of the picture; cells of the border that are noise
+const LIFT = 0.25, EDGE = 3; // height of a whole scale, in widths of the image; cells of the border that are noise
 const STEPS = [0.5, 1, 2, 5]; // mm of a whole scale of a surface
 const REACH = { "contact, %": [0, 5], "force, N": [0, 1], "depth, mm": [0, 0.2], "depth, widths": [0, 0.01], "slip, %": [0, 100] }; // of their curves at least
 const INFERNO = ["#000004", "#420a68", "#932667", "#dd513a", "#fca50a", "#fcffa4"]; // of depth, from none to the deepest
 const turned = { about: -0.5, tilt: 0.95 }; // radians, for all surfaces
 
-// Heights in parts of a whole scale, from a grey picture whose white is `scale` deep. They are smoothed, because its 256
+// Heights in parts of a whole scale, from a grey image whose white is `scale` deep. They are smoothed, because its 256
 // steps are no edges, and fall to nothing at the border, where what is measured curls up.
 function heightsOf(bitmap, scale, whole) {
   const { width, height } = bitmap, g = new OffscreenCanvas(width, height).getContext("2d", { willReadFrequently: true });
@@ -117,7 +117,7 @@ function drawScale(g, { width, height, whole, unit, wideMm }, place) {
 function showLayer(canvas, bitmap, measured) {
   const isSurface = Boolean(measured);
   const ratio = bitmap.width / bitmap.height;
-  if (!isSurface && canvas.ratio !== ratio) { // numbers and curves stand beside a picture that is higher than wide
+  if (!isSurface && canvas.ratio !== ratio) { // numbers and curves stand beside an image that is higher than wide
     canvas.ratio = ratio; // no style is set for a frame like the last one: the page would be laid out again
     const look = canvas.closest(".look");
     look?.classList.toggle("portrait", ratio < 1 / 1.1);
@@ -159,17 +159,17 @@ const stage = (canvas) => {
 
 // Force as a bar, and depth and area in words. `show` takes what was measured of a frame, or nothing.
 function forceBar() {
-  const bar = el("i", { className: "ours" }), value = el("span"), words = el("p", { className: "soft small" }), fault = el("p", { className: "soft small" });
+  const bar = el("i", { className: "ours" }), value = el("span"), words = el("p", { className: "soft small" }), doubt = el("p", { className: "soft small" }), fault = el("p", { className: "soft small" });
   const bars = el("div", { className: "bars small" }, el("span", {}, "force"), el("span", { className: "track" }, bar), value);
   const ramp = el("canvas", { width: 120, height: 10, role: "img", ariaLabel: "colours from no depth to the deepest" }), deepest = el("span");
   const scale = el("p", { className: "scale small" }, el("span", {}, "depth 0"), ramp, deepest);
-  const node = el("div", { className: "force" }, bars, words, scale, fault);
+  const node = el("div", { className: "force" }, bars, words, doubt, scale, fault);
   const g = ramp.getContext("2d"), colours = g.createLinearGradient(0, 0, 120, 0);
   INFERNO.forEach((colour, i) => colours.addColorStop(i / (INFERNO.length - 1), colour));
   g.fillStyle = colours;
   g.fillRect(0, 0, 120, 10);
   let most = 10; // N of a whole bar
-  const show = (one, layer = "frame") => {
+  const show = (one, layer = "frame", note = "") => {
     node.hidden = !one;
     if (!one) return;
     scale.hidden = layer !== "depth";
@@ -181,13 +181,14 @@ function forceBar() {
       most = Math.max(most, normal);
       bar.style.width = `${Math.max(0, (100 * normal) / most)}%`;
       value.textContent = `${normal.toFixed(1)} N`;
-      part.push(`90 % from ${one.force_low.toFixed(1)} to ${one.force_high.toFixed(1)} N (${one.case})`);
-      const arrow = sideways > one.sideways_std ? ` ${"→↘↓↙←↖↑↗"[Math.round((4 * Math.atan2(down, right)) / Math.PI + 8) % 8]}` : "";
+      part.push(`90 % from ${one.force_low.toFixed(1)} to ${one.force_high.toFixed(1)} N`);
+      const arrow = sideways > Math.max(one.sideways_std, 0.05) ? ` ${"→↘↓↙←↖↑↗"[Math.round((4 * Math.atan2(down, right)) / Math.PI + 8) % 8]}` : ""; // none beside 0.0 N
       part.push(`sideways${arrow} ${off(sideways, one.sideways_std, 1)} N`);
     }
     part.push(`depth ${off(one.depth, one.depth_std, one.unit === "mm" ? 2 : 4)} ${one.unit}`);
     part.push(one.unit === "mm" ? `contact ${one.area.toFixed(0)} mm²` : "no mm and N, since the sensor is not known");
     words.textContent = part.join(", ");
+    doubt.textContent = note || (one.calibrated || one.unit !== "mm" ? "" : `Of ${one.case}: mm and N are a first guess until a ball and a weight calibrate it.`);
     fault.textContent = one.faults.length ? `Do not trust these values: ${one.faults.join(" ")}` : "";
   };
   show(null);

@@ -6,6 +6,7 @@ for the others.
 
 from __future__ import annotations
 
+import re
 import shutil
 import signal
 import subprocess
@@ -372,3 +373,111 @@ def test_touches_are_found_by_their_thumbnails(browse):
     page.locator(".thumbs button").click()
     page.wait_for_selector("text=of 1 touches")
     assert page.locator(".clip").count() == 2
+
+
+@pytest.mark.slow
+def test_answers_that_overtake_each_other_leave_the_newest_on_the_page(browse, camera):
+    """On a busy machine an answer may come after that of a later question."""
+    page = browse(2)
+    until(page, f"{FRAMES} > 5")
+    page.evaluate("""() => {
+        const plain = window.fetch;
+        window.late = [];
+        window.fetch = async (path, ...more) => {
+            const answer = await plain(path, ...more);
+            if (!String(path).endsWith("taught") || window.late.length) return answer;
+            await new Promise((go) => window.late.push(go));
+            return answer;
+        };
+    }""")
+    record = page.locator("button.record")
+
+    def press(name: str) -> None:
+        page.get_by_label("name of what you touch").fill(name)
+        record.hover()
+        page.mouse.down()
+        page.wait_for_selector(f"text=Recording {name}")
+        page.wait_for_timeout(600)
+        page.mouse.up()
+        page.wait_for_selector("text=Hold to record")
+
+    for name in ("early", "later"):
+        press(name)
+    until(page, "window.late.length === 1")
+    page.wait_for_timeout(1000)
+    page.evaluate("window.late[0]()")
+    page.wait_for_selector(".names >> text=later", timeout=5000)
+    page.wait_for_timeout(500)
+    assert page.locator(".names >> text=later").count() == 1
+    train = page.locator(".teach button", has_text=re.compile("^Train( again)?$"))
+    assert train.is_enabled()
+    page.close()
+
+
+@pytest.mark.slow
+def test_a_press_right_after_another_records(browse, camera):
+    """Frames that are under way still say that the last recording is on."""
+    page = browse(2)
+    until(page, f"{FRAMES} > 5")
+    page.get_by_label("name of what you touch").fill("again")
+    orders = []
+    page.on(
+        "request",
+        lambda one: orders.append(one.post_data_json["do"]) if "control" in one.url else None,
+    )
+    record = page.locator("button.record")
+    record.hover()
+    page.mouse.down()
+    page.wait_for_selector("text=Recording again")
+    page.wait_for_timeout(600)
+    page.mouse.up()
+    page.mouse.down()
+    page.wait_for_timeout(800)
+    page.mouse.up()
+    page.wait_for_selector("text=Hold to record")
+    assert orders == ["record", "stop", "record", "stop"]
+    page.close()
+
+
+@pytest.mark.slow
+def test_numbers_and_curves_of_live_touch_are_above_the_fold(browse, camera):
+    page = browse(2, 1440)
+    page.set_viewport_size({"width": 1440, "height": 900})
+    until(page, f"{FRAMES} > 15")
+    page.wait_for_selector(".look .chart")
+    charts = "[...document.querySelectorAll('.look .chart')]"
+    lowest = f"Math.max(...{charts}.map((one) => one.getBoundingClientRect().bottom))"
+    until(page, f"{lowest} > 0")
+    assert page.evaluate(lowest) <= 900
+
+
+@pytest.mark.slow
+def test_a_command_is_broken_between_its_words(browse):
+    page = browse(3, 375)
+    page.wait_for_selector("code span")
+    heights = page.locator("code span").evaluate_all("all => all.map(one => one.offsetHeight)")
+    assert len(heights) > 5 and max(heights) < 26
+
+
+@pytest.mark.slow
+def test_what_is_not_known_yet_is_told_from_what_is_missing(browse):
+    page = browse(3)
+    said = "isMeasured => verdict({}, isMeasured)[0].textContent"
+    assert "is being measured" in page.evaluate(said, False)
+    assert "Record each name twice" in page.evaluate(said, True)
+
+
+@pytest.mark.slow
+def test_how_far_to_trust_a_force_stands_below_it(browse):
+    page = browse(3)
+    told = """([calibrated, note]) => {
+        const bar = forceBar();
+        const force = { force: [0.01, 0, 2], force_low: 1, force_high: 4, sideways_std: 0 };
+        const depth = { scale: 1, unit: "mm", depth: 0.5, depth_std: 0.1, area: 3, faults: [] };
+        bar.show({ ...force, ...depth, case: "a sensor", calibrated }, "depth", note);
+        return bar.node.textContent;
+    }"""
+    assert "first guess" in page.evaluate(told, [False, ""])
+    assert "first guess" not in page.evaluate(told, [True, ""])
+    assert "another gel" in page.evaluate(told, [True, "It shows another gel."])
+    assert "sideways 0.0 N" in page.evaluate(told, [True, ""]).replace(" ± 0.0", "")

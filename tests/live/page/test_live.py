@@ -28,10 +28,12 @@ from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.live.page import live as live_module
+from anytouch_jax.live.page import packet as packet_module
 from anytouch_jax.live.page import server
 from anytouch_jax.live.page.feature_map import FeatureMap
 from anytouch_jax.live.page.live import Live
 from anytouch_jax.live.page.recorder import SCORE, LiveRecorder
+from anytouch_jax.live.page.setup import make_setup
 
 PAGE = {"X-Anytouch": "1"}
 # image, contact score and features
@@ -157,6 +159,10 @@ def test_live_touch_is_measured(encoder, tmp_path, monkeypatch):
                 and pressed["fields"]["force"][2] > 0.1 > free["fields"]["force"][2]
             )
             assert {"contact", "force, N", "depth, mm", "slip, %"} == set(pressed["curves"])
+            # The frame was compared with its background before.
+            with monkeypatch.context() as patch:
+                patch.delattr(packet_module, "touch_layer")
+                assert opened(packet_module.packet(live._newest, layer))[0]["layer"] == layer
         # no frame is read in one way and measured in another
         for rotate in (90, 0) * 40:
             live.frames.orient(rotate, "none")
@@ -167,6 +173,40 @@ def test_live_touch_is_measured(encoder, tmp_path, monkeypatch):
     finally:
         live.stop()
         runner.close()
+
+
+def test_a_background_that_does_not_fit_the_calibration_is_said(encoder):
+    """Of another gel deviations are wider, of another device nothing is measured."""
+    gel = np.full((48, 64, 3), 128, np.uint8)
+
+    class Measuring:
+        """The encoder, with a calibrated sensor."""
+
+        measures = True
+
+        def __getattr__(self, name: str):
+            return getattr(encoder, name)
+
+        def measure_of(self, sensor, background, log):
+            if sensor == "other":
+                raise UserError("another device.")
+            if sensor == "worn":
+                log("another gel: deviations are wider.")
+            return log
+
+    notes = {}
+    logged = []
+    for sensor in ("same", "worn", "other"):
+        setup = make_setup(Measuring(), sensor, 0, "none", gel, log=logged.append)
+        if setup.measure is not None:
+            setup.measure("do not trust this frame")
+        notes[sensor] = (setup.note, setup.measure is not None)
+    assert notes == {
+        "same": ("", True),
+        "worn": ("another gel: deviations are wider.", True),
+        "other": ("another device.", False),
+    }
+    assert logged == ["another gel: deviations are wider.", "another device."]
 
 
 def test_a_stopped_camera_does_not_stop_the_page(encoder, video, tmp_path):

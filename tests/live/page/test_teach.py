@@ -1,5 +1,6 @@
 """The accuracy that the page shows of a taught head is on recordings that no fit has seen."""
 
+import threading
 import time
 
 import numpy as np
@@ -108,3 +109,19 @@ def test_what_was_trained_longer_is_of_one_sensor(tmp_path):
         "digit": str(folder / "tuned"),
         "gelsight": str(folder / "tuned_gelsight"),
     }
+
+
+def test_the_page_hears_at_once_that_it_trains(encoder, tmp_path, monkeypatch):
+    recorder = LiveRecorder(tmp_path, "digit")
+    for name in ("cup", "key"):
+        recorder.start(name, None)
+        recorder.add(np.zeros((8, 8, 3), np.uint8), PRESSED, np.zeros(WIDTH, np.float32))
+        recorder.stop()
+    teacher = Teacher(encoder, recorder, log=lambda _: None)
+    ends = threading.Event()
+    monkeypatch.setattr(teacher, "_fit", lambda _: ends.wait(60))
+    before = teacher.version
+    teacher.train()
+    noticed = teacher.version
+    ends.set()
+    assert noticed > before

@@ -2,13 +2,13 @@
 // What was measured: the surface of the gel, which can be turned, and force and depth as a bar and in words.
 
 const VIEW = [640, 440]; // pixels of the view
-const LIFT = 0.25, EDGE = 3; // height of a whole scale, in widths of the picture; cells of the border that are noise
+const LIFT = 0.25, EDGE = 3; // height of a whole scale, in widths of the image; cells of the border that are noise
 const STEPS = [0.5, 1, 2, 5]; // mm of a whole scale of a surface
 const REACH = { "contact, %": [0, 5], "force, N": [0, 1], "depth, mm": [0, 0.2], "depth, widths": [0, 0.01], "slip, %": [0, 100] }; // of their curves at least
 const INFERNO = ["#000004", "#420a68", "#932667", "#dd513a", "#fca50a", "#fcffa4"]; // of depth, from none to the deepest
 const turned = { about: -0.5, tilt: 0.95 }; // radians, for all surfaces
 
-// Heights in parts of a whole scale, from a grey picture whose white is `scale` deep. They are smoothed, because its 256
+// Heights in parts of a whole scale, from a grey image whose white is `scale` deep. They are smoothed, because its 256
 // steps are no edges, and fall to nothing at the border, where what is measured curls up.
 function heightsOf(bitmap, scale, whole) {
   const { width, height } = bitmap, g = new OffscreenCanvas(width, height).getContext("2d", { willReadFrequently: true });
@@ -29,12 +29,20 @@ function heightsOf(bitmap, scale, whole) {
 }
 
 // A height field in perspective, lit from the upper left, on a dark ground, with bars in mm. Triangles with a depth
-// buffer: it works on machines without a graphics card, in some milliseconds.
+// buffer: it works on machines without a graphics card, in some milliseconds. What its size does not change is kept.
+const depthBuffer = new Float32Array(VIEW[0] * VIEW[1]);
+let vertices = { count: 0 };
+function verticesOf(count) {
+  if (vertices.count !== count) vertices = { count, ...Object.fromEntries([..."xyzrgb"].map((name) => [name, new Float32Array(count)])) };
+  return vertices;
+}
+
 function drawSurface(canvas) {
   const { heights, width, height } = canvas.surface, [wide, tall] = VIEW, count = width * height;
   if (canvas.width !== wide || canvas.height !== tall) [canvas.width, canvas.height] = VIEW;
   const g = canvas.getContext("2d"), image = g.createImageData(wide, tall), pixels = new Uint32Array(image.data.buffer);
-  const near = new Float32Array(wide * tall).fill(-9), x = new Float32Array(count), y = new Float32Array(count), z = new Float32Array(count), light = new Float32Array(count);
+  const { x, y, z, r, g: green, b } = verticesOf(count);
+  depthBuffer.fill(-9);
   const [sa, ca, st, ct] = [Math.sin(turned.about), Math.cos(turned.about), Math.sin(turned.tilt), Math.cos(turned.tilt)];
   const turn = (a, b, c) => [a * ca - b * sa, (a * sa + b * ca) * ct - c * st, (a * sa + b * ca) * st + c * ct]; // right, down, near
   const flat = (a, b, c) => { const [right, down, nearer] = turn(a, b, c), far = 2.4 / (2.4 - nearer); return [far * right, far * down, nearer]; };
@@ -44,34 +52,40 @@ function drawSurface(canvas) {
   const scale = 0.94 * Math.min(wide / (right - left), tall / (bottom - top)), middle = [wide / 2 - (scale * (left + right)) / 2, tall / 2 - (scale * (top + bottom)) / 2];
   const place = (a, b, c) => { const [u, v, nearer] = flat(a, b, c); return [middle[0] + scale * u, middle[1] + scale * v, nearer]; };
   for (let i = 0; i < count; i++) {
-    const column = i % width, row = (i - column) / width, at = (r, c) => heights[Math.min(Math.max(r, 0), height - 1) * width + Math.min(Math.max(c, 0), width - 1)];
+    const column = i % width, row = (i - column) / width;
     [x[i], y[i], z[i]] = place((column + 0.5) / width - 0.5, (row + 0.5 - height / 2) / width, LIFT * heights[i]);
-    const a = -LIFT * width * (at(row, column + 1) - at(row, column - 1)) / 2, b = -LIFT * width * (at(row + 1, column) - at(row - 1, column)) / 2;
-    const [na, nb, nc] = turn(a, b, 1), long = Math.hypot(a, b, 1), facing = Math.max(0, (-0.5 * na - 0.55 * nb + 0.67 * nc) / long);
-    light[i] = 0.35 + 0.75 * facing + 0.5 * facing ** 24; // ground light, light, gloss
+    const across = heights[column < width - 1 ? i + 1 : i] - heights[column > 0 ? i - 1 : i], along = heights[row < height - 1 ? i + width : i] - heights[row > 0 ? i - width : i];
+    const tiltA = (-LIFT * width * across) / 2, tiltB = (-LIFT * width * along) / 2, [na, nb, nc] = turn(tiltA, tiltB, 1);
+    const facing = Math.max(0, (-0.5 * na - 0.55 * nb + 0.67 * nc) / Math.sqrt(tiltA * tiltA + tiltB * tiltB + 1));
+    const light = 0.35 + 0.75 * facing + 0.5 * facing ** 24, high = Math.min(1, heights[i]); // ground light, light, gloss
+    r[i] = Math.min(255, light * (86 + 160 * high)); // slate to amber
+    green[i] = Math.min(255, light * (112 + 62 * high));
+    b[i] = Math.min(255, light * (122 - 70 * high));
   }
   const triangle = (i, j, k) => {
     const area = (x[j] - x[i]) * (y[k] - y[i]) - (x[k] - x[i]) * (y[j] - y[i]);
     if (Math.abs(area) < 1e-6) return;
-    const left = Math.max(0, Math.ceil(Math.min(x[i], x[j], x[k]))), right = Math.min(wide - 1, Math.floor(Math.max(x[i], x[j], x[k])));
-    const top = Math.max(0, Math.ceil(Math.min(y[i], y[j], y[k]))), bottom = Math.min(tall - 1, Math.floor(Math.max(y[i], y[j], y[k])));
-    for (let v = top; v <= bottom; v++) {
-      for (let u = left; u <= right; u++) {
-        const p = ((x[j] - u) * (y[k] - v) - (x[k] - u) * (y[j] - v)) / area, q = ((x[k] - u) * (y[i] - v) - (x[i] - u) * (y[k] - v)) / area, r = 1 - p - q;
-        if (p < -1e-4 || q < -1e-4 || r < -1e-4) continue;
-        const depth = p * z[i] + q * z[j] + r * z[k], at = v * wide + u;
-        if (depth <= near[at]) continue;
-        near[at] = depth;
-        const lit = p * light[i] + q * light[j] + r * light[k], high = Math.min(1, p * heights[i] + q * heights[j] + r * heights[k]);
-        const red = Math.min(255, lit * (86 + 160 * high)), green = Math.min(255, lit * (112 + 62 * high)), blue = Math.min(255, lit * (122 - 70 * high)); // slate to amber
-        pixels[at] = 0xff000000 | (blue << 16) | (green << 8) | red;
+    const low = Math.max(0, Math.ceil(Math.min(x[i], x[j], x[k]))), far = Math.min(wide - 1, Math.floor(Math.max(x[i], x[j], x[k])));
+    const first = Math.max(0, Math.ceil(Math.min(y[i], y[j], y[k]))), last = Math.min(tall - 1, Math.floor(Math.max(y[i], y[j], y[k])));
+    // Weights of the corners are linear in the place, and so is everything that they mix.
+    const pu = (y[j] - y[k]) / area, pv = (x[k] - x[j]) / area, qu = (y[k] - y[i]) / area, qv = (x[i] - x[k]) / area;
+    const zp = z[i] - z[k], zq = z[j] - z[k], rp = r[i] - r[k], rq = r[j] - r[k], gp = green[i] - green[k], gq = green[j] - green[k], bp = b[i] - b[k], bq = b[j] - b[k];
+    for (let v = first; v <= last; v++) {
+      let p = (low - x[k]) * pu + (v - y[k]) * pv, q = (low - x[k]) * qu + (v - y[k]) * qv;
+      for (let at = v * wide + low, end = v * wide + far; at <= end; at++, p += pu, q += qu) {
+        if (p < -1e-4 || q < -1e-4 || p + q > 1.0001) continue;
+        const depth = z[k] + p * zp + q * zq;
+        if (depth <= depthBuffer[at]) continue;
+        depthBuffer[at] = depth;
+        pixels[at] = 0xff000000 | ((b[k] + p * bp + q * bq) << 16) | ((green[k] + p * gp + q * gq) << 8) | (r[k] + p * rp + q * rq);
       }
     }
   };
-  for (let i = 0; i < count - width; i++) {
-    if (i % width === width - 1) continue;
-    triangle(i, i + 1, i + width);
-    triangle(i + 1, i + width + 1, i + width);
+  for (let row = 0; row < height - 1; row++) {
+    for (let i = row * width; i < (row + 1) * width - 1; i++) {
+      triangle(i, i + 1, i + width);
+      triangle(i + 1, i + width + 1, i + width);
+    }
   }
   g.putImageData(image, 0, 0);
   drawScale(g, canvas.surface, place);
@@ -103,7 +117,7 @@ function drawScale(g, { width, height, whole, unit, wideMm }, place) {
 function showLayer(canvas, bitmap, measured) {
   const isSurface = Boolean(measured);
   const ratio = bitmap.width / bitmap.height;
-  if (!isSurface && canvas.ratio !== ratio) { // numbers and curves stand beside a picture that is higher than wide
+  if (!isSurface && canvas.ratio !== ratio) { // numbers and curves stand beside an image that is higher than wide
     canvas.ratio = ratio; // no style is set for a frame like the last one: the page would be laid out again
     const look = canvas.closest(".look");
     look?.classList.toggle("portrait", ratio < 1 / 1.1);
@@ -145,17 +159,17 @@ const stage = (canvas) => {
 
 // Force as a bar, and depth and area in words. `show` takes what was measured of a frame, or nothing.
 function forceBar() {
-  const bar = el("i", { className: "ours" }), value = el("span"), words = el("p", { className: "soft small" }), fault = el("p", { className: "soft small" });
+  const bar = el("i", { className: "ours" }), value = el("span"), words = el("p", { className: "soft small" }), doubt = el("p", { className: "soft small" }), fault = el("p", { className: "soft small" });
   const bars = el("div", { className: "bars small" }, el("span", {}, "force"), el("span", { className: "track" }, bar), value);
   const ramp = el("canvas", { width: 120, height: 10, role: "img", ariaLabel: "colours from no depth to the deepest" }), deepest = el("span");
   const scale = el("p", { className: "scale small" }, el("span", {}, "depth 0"), ramp, deepest);
-  const node = el("div", { className: "force" }, bars, words, scale, fault);
+  const node = el("div", { className: "force" }, bars, words, doubt, scale, fault);
   const g = ramp.getContext("2d"), colours = g.createLinearGradient(0, 0, 120, 0);
   INFERNO.forEach((colour, i) => colours.addColorStop(i / (INFERNO.length - 1), colour));
   g.fillStyle = colours;
   g.fillRect(0, 0, 120, 10);
   let most = 10; // N of a whole bar
-  const show = (one, layer = "frame") => {
+  const show = (one, layer = "frame", note = "") => {
     node.hidden = !one;
     if (!one) return;
     scale.hidden = layer !== "depth";
@@ -167,13 +181,14 @@ function forceBar() {
       most = Math.max(most, normal);
       bar.style.width = `${Math.max(0, (100 * normal) / most)}%`;
       value.textContent = `${normal.toFixed(1)} N`;
-      part.push(`90 % from ${one.force_low.toFixed(1)} to ${one.force_high.toFixed(1)} N (${one.case})`);
-      const arrow = sideways > one.sideways_std ? ` ${"→↘↓↙←↖↑↗"[Math.round((4 * Math.atan2(down, right)) / Math.PI + 8) % 8]}` : "";
+      part.push(`90 % from ${one.force_low.toFixed(1)} to ${one.force_high.toFixed(1)} N`);
+      const arrow = sideways > Math.max(one.sideways_std, 0.05) ? ` ${"→↘↓↙←↖↑↗"[Math.round((4 * Math.atan2(down, right)) / Math.PI + 8) % 8]}` : ""; // none beside 0.0 N
       part.push(`sideways${arrow} ${off(sideways, one.sideways_std, 1)} N`);
     }
     part.push(`depth ${off(one.depth, one.depth_std, one.unit === "mm" ? 2 : 4)} ${one.unit}`);
     part.push(one.unit === "mm" ? `contact ${one.area.toFixed(0)} mm²` : "no mm and N, since the sensor is not known");
     words.textContent = part.join(", ");
+    doubt.textContent = note || (one.calibrated || one.unit !== "mm" ? "" : `Of ${one.case}: mm and N are a first guess until a ball and a weight calibrate it.`);
     fault.textContent = one.faults.length ? `Do not trust these values: ${one.faults.join(" ")}` : "";
   };
   show(null);

@@ -133,6 +133,7 @@ def field_numbers(measured: Fields) -> dict[str, Any]:
         "force_low": about["force_low"],
         "force_high": about["force_high"],
         "case": _CASES[measured.case],
+        "calibrated": measured.case == "calibrated",
         "sideways_std": about["force_x_std"],
         "depth": about["depth"],
         "depth_std": about["depth_std"],

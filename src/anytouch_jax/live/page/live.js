@@ -2,18 +2,20 @@
 // Live touch, and a classifier that is taught by touching.
 
 const KEPT_LIVE = 300, HELD = 400; // points of a live curve, ms from which a pressed button was held
+const KEPT_AGES = 600; // frames whose ages make p50 and p99
 const CURVES = 100, WORDS = 300; // ms between drawings of the curves, and between changes of words, which people read
 
-const percent = (share) => `${Math.round(100 * share)} %`;
+const percent = (fraction) => `${Math.round(100 * fraction)} %`;
 
 // How good the head is, in words and as bars.
-function verdict(result) {
+function verdict(result, isMeasured) {
+  if (!isMeasured) return [el("p", { className: "soft" }, "It names already. How good it is on recordings that are left out is being measured.")];
   if (result.right === undefined) return [el("p", { className: "soft" }, "Record each name twice or more. Then the page measures how good the head is.")];
   const range = (name) => (result[`${name}_low`] < result[`${name}_high`] ? ` (${Math.round(100 * result[`${name}_low`])} to ${Math.round(100 * result[`${name}_high`])})` : "");
-  const bar = (name, share, own, note) => {
+  const bar = (name, fraction, own, note) => {
     const inner = el("i", { className: own ? "ours" : "" });
-    inner.style.width = `${100 * share}%`;
-    return [el("span", {}, name), el("span", { className: "track" }, inner), el("span", {}, percent(share) + note)];
+    inner.style.width = `${100 * fraction}%`;
+    return [el("span", {}, name), el("span", { className: "track" }, inner), el("span", {}, percent(fraction) + note)];
   };
   const better = result.right > result.pixels;
   const useless = result.right > result.chance ? "" : " That is no better than the commonest name alone: record each name again.";
@@ -28,29 +30,32 @@ function showLive(source, about) {
   const canvas = el("canvas", { role: "img", ariaLabel: "live image" }), curves = el("section", { className: "time" });
   const felt = el("h2", { className: "felt" }), sure = el("div", { className: "bars small" }), why = el("p", { className: "soft" });
   const facts = el("div", { className: "facts" }), near = el("div", { className: "thumbs" }), nearest = el("div", { className: "thumbs" });
-  const force = forceBar(), pictures = about.table === null ? null : framesOf(about.table, "frame", true);
-  const ages = [], scores = {}, boxes = {}, view = { rotate: 0, flip: "none" };
-  let drawnAt = 0, toldAt = 0, stopped = new AbortController(), shownNear = "", done = null, recording = false, pressed = 0, taught = -1, trained = false, orders = Promise.resolve();
-  let recorded = new Pictures(`${source}/recorded`, "frame", true);
+  const force = forceBar(), images = about.table === null ? null : framesOf(about.table, "frame", true);
+  const ages = [], parts = [], scores = {}, boxes = {}, view = { rotate: 0, flip: "none" };
+  let drawnAt = 0, toldAt = 0, stopped = new AbortController(), shownNear = "", done = null, recording = false, asked = "", pressed = 0, taught = -1, learning = false, listed = "", trained = false, orders = Promise.resolve();
+  let recorded = new Images(`${source}/recorded`, "frame", true);
   const fact = (name, value, kind = "") => {
     boxes[name] ??= facts.appendChild(el("div", { className: "fact" }, name, el("b")));
     if (boxes[name].lastChild.textContent !== value) boxes[name].lastChild.textContent = value;
     boxes[name].className = `fact ${kind}`;
   };
   // Orders go one after the other: a recording begins before it ends.
-  const send = (body, more) => (orders = orders.then(() => { say(""); return order(source, body, more); }).catch((error) => say(error.message, true)));
+  const send = (body, more) => (orders = orders.then(() => { say(""); return order(source, body, more); }).catch((error) => { say(error.message, true); }));
   const turn = () => send({ do: "orient", rotate: Number(view.rotate), flip: view.flip });
 
   // Teach: hold the button to record, or press it shortly to record until the next press.
   const known = el("datalist", { id: "known-names" });
   const object = el("input", { list: known.id, maxLength: 100, autocomplete: "off", placeholder: "cup" });
   const record = el("button", { className: "main record" }, "Hold to record");
+  // Frames that are under way still tell of the recording before. Until one shows what was ordered, the order counts.
+  const isOn = () => (asked ? asked === "record" : recording);
+  const direct = (body) => { asked = body.do; send(body).then((done) => { if (!done) asked = ""; }); };
   const begin = () => {
-    if (recording || pressed) { end(); return; }
+    if (isOn() || pressed) { end(); return; }
     pressed = performance.now();
-    send({ do: "record", object: object.value });
+    direct({ do: "record", object: object.value });
   };
-  const end = () => { pressed = 0; send({ do: "stop" }); };
+  const end = () => { pressed = 0; direct({ do: "stop" }); };
   const release = () => { if (pressed && performance.now() - pressed > HELD) end(); else pressed = 0; };
   const hold = (event) => [" ", "Enter"].includes(event.key) && (event.preventDefault(), true);
   record.addEventListener("pointerdown", (event) => { if (event.button === 0) { record.setPointerCapture(event.pointerId); begin(); } });
@@ -73,10 +78,8 @@ function showLive(source, about) {
   });
   const downloads = el("div", { className: "bar" }, el("button", { onclick: save("head.npz") }, "Download head"),
     el("button", { onclick: save("recordings.zip") }, "Download recordings"));
-  const learn = guard(async () => {
-    const found = await json(`${source}/taught`), several = Object.entries(found.names);
-    recorded = new Pictures(`${source}/recorded`, "frame", true);
-    trained = found.trained;
+  const listNames = (several) => {
+    recorded = new Images(`${source}/recorded`, "frame", true);
     known.replaceChildren(...several.map(([name]) => el("option", { value: name })));
     names.replaceChildren(...several.map(([name, one]) => {
       const count = `${one.recordings} ${one.recordings === 1 ? "recording" : "recordings"}`;
@@ -84,6 +87,12 @@ function showLive(source, about) {
         el("button", { className: "quiet small", title: "Its frames stay on the disk.", ariaLabel: `Leave out last recording of ${name}`,
           onclick: () => send({ do: "leave out", sequence: one.last }) }, "Leave out last"));
     }));
+  };
+  const learn = async () => {
+    const found = await json(`${source}/taught`), several = Object.entries(found.names);
+    trained = found.trained;
+    // The list stays while it is the same: a button that is replaced under a finger cannot be pressed.
+    if (listed !== JSON.stringify(several)) { listed = JSON.stringify(several); listNames(several); }
     train.disabled = found.training || Boolean(found.missing);
     train.className = several.length > 1 && !found.trained ? "main" : "";
     train.textContent = found.training ? (found.trained && found.result.right === undefined ? "Measuring …" : "Training …") : found.trained ? "Train again" : "Train";
@@ -95,6 +104,7 @@ function showLive(source, about) {
     longer.title = "Trains the encoder too, on all recordings. Some are held out, and it never ends below the head.";
     train.disabled ||= more.on;
     course.className = more.fault ? "alarm" : "soft";
+    course.ariaLive = more.on ? "off" : "polite"; // a screen reader would read each second
     course.textContent = more.on ? `Training the encoder: ${clock(more.left)} left${more.score ? `. On held-out recordings: ${more.score}, the head alone: ${more.before}.` : ""}` : more.fault || more.said;
     missing.className = found.fault ? "alarm" : "soft";
     missing.textContent = found.fault || (several.length ? found.missing : "Type a name, hold the button, and touch. Touch it again for a second recording. Then teach another name.");
@@ -102,7 +112,19 @@ function showLive(source, about) {
     downloads.firstChild.disabled = !found.trained;
     const by = more.used ? `--model ${more.folder}` : `--head ${found.file}`;
     const use = `anytouch stream --data ${/^\d+$/.test(about.source) ? about.source : "0"} ${about.sensor ? `--sensor ${about.sensor} ` : ""}${by} --out -`;
-    result.replaceChildren(...(found.trained ? [...verdict(found.result), el("p", { className: "soft small" }, "Use it in a robot:"), el("code", {}, use)] : []));
+    result.replaceChildren(...(found.trained ? [...verdict(found.result, !found.training || found.result.right !== undefined), el("p", { className: "soft small" }, "Use it in a robot:"), command(use)] : []));
+  };
+  // One question at a time: on a busy machine, an answer could come after that of a later question and stay.
+  const learnOnce = guard(async (version) => {
+    if (learning) return;
+    learning = true;
+    try {
+      await learn();
+      taught = version;
+    } catch (error) {
+      await new Promise((go) => setTimeout(go, 1000)); // then the next frame asks again
+      throw error;
+    } finally { learning = false; }
   });
 
   const curve = (name, value, level) => {
@@ -153,19 +175,21 @@ function showLive(source, about) {
     else if (!one.set.length) why.textContent = "No name is likely enough.";
     else if (one.set.length > 1) why.textContent = `It may be ${one.set.slice(0, 4).join(", ")}.`;
   };
-  const percentile = (values, share) => [...values].sort((a, b) => a - b)[Math.floor(share * (values.length - 1))] ?? 0;
-  const show = async (one, jpeg) => {
+  const percentile = (values, fraction) => [...values].sort((a, b) => a - b)[Math.floor(fraction * (values.length - 1))] ?? 0;
+  const show = async (one, jpeg, arrived) => {
     if (one.error) { say(one.error, true); return; }
     const bitmap = await createImageBitmap(new Blob([jpeg], { type: "image/jpeg" }));
     showLayer(canvas, bitmap, one.layer === "surface" ? one.fields : null);
     bitmap.close();
-    const age = performance.timeOrigin + performance.now() - one.grabbed;
-    ages.push(age);
-    if (ages.length > 600) ages.shift();
+    const drawn = performance.timeOrigin + performance.now();
+    ages.push(drawn - one.grabbed);
+    parts.push([one.sent - one.grabbed, arrived - one.sent, drawn - arrived]); // to its packet, to the page, to the canvas
+    for (const list of [ages, parts]) if (list.length > KEPT_AGES) list.shift();
     const draws = Object.entries(curvesOf(one)).map(([name, value]) => curve(name, value, name === CONTACT ? inPercent(one.threshold) : null));
     main.dataset.frames = Number(main.dataset.frames ?? 0) + 1;
-    if (one.taught !== taught) { taught = one.taught; learn(); }
+    if (one.taught !== taught) learnOnce(one.taught);
     recording = one.recording.on;
+    if (asked && recording === (asked === "record")) asked = "";
     const now = performance.now();
     if (now - drawnAt > CURVES) {
       drawnAt = now;
@@ -174,9 +198,11 @@ function showLive(source, about) {
     if (now - toldAt < WORDS) return;
     toldAt = now;
     main.dataset.ages = JSON.stringify([percentile(ages, 0.5), percentile(ages, 0.99), Math.max(...ages)].map(Math.round));
+    main.dataset.parts = JSON.stringify([0, 1, 2].map((i) => Number(percentile(parts.map((each) => each[i]), 0.5).toFixed(1))));
     feel(one);
-    force.show(one.fields, one.layer);
+    force.show(one.fields, one.layer, one.note);
     hidden.hidden = one.layer === state.layer;
+    hidden.textContent = one.note ? `${one.note} Nothing is measured, so the image is shown.` : "The untouched gel is not known yet, so the image is shown.";
     record.textContent = recording ? `Recording ${one.recording.name}: ${one.recording.written} frames` : "Hold to record";
     record.classList.toggle("on", recording);
     const lost = one.recording.lost ? ` ${one.recording.lost} frames were lost, since the disk is slow.` : "";
@@ -191,8 +217,8 @@ function showLive(source, about) {
     const hits = JSON.stringify([one.near, one.recorded].map((found) => found?.map((hit) => hit.row)));
     if (hits === shownNear) return;
     shownNear = hits;
-    near.replaceChildren(...(one.near ?? []).map((hit) => hitCard(hit, pictures, guard(async () => {
-      if (pictures) select(about.table, (await json(`${about.table}/touch?row=${hit.table_row}`)).place);
+    near.replaceChildren(...(one.near ?? []).map((hit) => hitCard(hit, images, guard(async () => {
+      if (images) select(about.table, (await json(`${about.table}/touch?row=${hit.table_row}`)).place);
     }))));
     nearest.replaceChildren(...(one.recorded ?? []).slice(0, 2).map((hit) =>
       el("figure", {}, recorded.image(hit.table_row, `recorded touch of ${hit.about.object}`), el("figcaption", {}, `${hit.about.object}, alike ${hit.cosine.toFixed(2)}`))));
@@ -200,7 +226,7 @@ function showLive(source, about) {
   const read = guard(async () => {
     stopped.abort();
     stopped = new AbortController();
-    // A picture has no more pixels than are shown: the browser decodes each of them.
+    // An image has no more pixels than are shown: the browser decodes each of them.
     const side = Math.round((window.devicePixelRatio || 1) * Math.max(canvas.clientWidth, canvas.clientHeight)) || 640;
     const reader = (await api(`${source}/stream?layer=${state.layer}&side=${side}`, { signal: stopped.signal })).body.getReader();
     let data = new Uint8Array(0), newest = null, drawing = false;
@@ -221,7 +247,7 @@ function showLive(source, about) {
         const view = new DataView(data.buffer, data.byteOffset, data.length);
         const text = data.length >= 4 ? view.getUint32(0, true) : 0, end = data.length >= 8 + text ? view.getUint32(4 + text, true) : 0;
         if (data.length < 8 + text || data.length < 8 + text + end || data.length < 8) break;
-        newest = [JSON.parse(new TextDecoder().decode(data.subarray(4, 4 + text))), data.slice(8 + text, 8 + text + end)];
+        newest = [JSON.parse(new TextDecoder().decode(data.subarray(4, 4 + text))), data.slice(8 + text, 8 + text + end), performance.timeOrigin + performance.now()];
         data = data.slice(8 + text + end);
       }
       if (newest && !drawing) draw();
@@ -229,7 +255,7 @@ function showLive(source, about) {
   });
 
   const layers = layerBar(about.layers, read);
-  const hidden = el("span", { className: "soft", hidden: true }, "The untouched gel is not known yet, so the image is shown.");
+  const hidden = el("span", { className: "soft", hidden: true });
   const background = el("button", { onclick: () => send({ do: "background" }) }, "Capture the untouched gel");
   const feels = el("section", { className: "card feels", hidden: true }, felt, sure, why, nearest);
   // On a phone this bar stays at the bottom, under the thumb.
@@ -239,10 +265,10 @@ function showLive(source, about) {
     option("rotate", [0, 90, 180, 270].map((angle) => [angle, `${angle}°`]), 0, (value) => { view.rotate = value; turn(); }),
     option("flip", [["none", "none"], ["across", "left-right"], ["down", "top-bottom"]], "none", (value) => { view.flip = value; turn(); }),
     background, el("button", { onclick: () => send({ do: "no background" }) }, "Estimate it again")), facts));
-  const picture = el("div", { className: "look" }, el("div", { className: "column" }, stage(canvas), hidden), el("div", { className: "column" }, force.node, curves));
+  const look = el("div", { className: "look" }, el("div", { className: "column" }, stage(canvas), hidden), el("div", { className: "column" }, force.node, curves));
   main.replaceChildren(el("div", { className: "split live" }, feels,
     el("div", { className: "column shown" }, el("div", { className: "bar" }, el("h2", {}, state.sources[source].name), el("div", { className: "push" }, layers.node)),
-      picture, el("h3", { hidden: about.table === null }, "Nearest known touches"), near),
+      look, el("h3", { hidden: about.table === null }, "Nearest known touches"), near),
     teach), more);
   keys([["r", "hold to record", () => { if (!state.repeated) begin(); }], ["l", "next layer", layers.next], ["b", "capture the untouched gel", () => background.click()]]);
   document.addEventListener("keyup", lifted);

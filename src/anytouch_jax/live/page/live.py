@@ -181,6 +181,7 @@ class Live:
             "grabbed": 1e3 * (frame.started + frame.at),
             "picture": frame.image,
             "gel": "captured" if setup.running is None else "estimated",
+            "note": setup.note,
             "encoder": encoder.round(2).tolist(),
             "age": age.round(2).tolist(),
             "missed": frame.missed,

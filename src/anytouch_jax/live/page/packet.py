@@ -79,19 +79,28 @@ def describe_touch(score: float, threshold: float, fields: Fields | None) -> dic
 def packet(shown: Shown, layer: str, side: int = SIDE) -> bytes:
     """Return a frame for the page: length u32, JSON, length u32, JPEG, little endian.
 
-    The long side of the picture has at most `side` pixels: as many as the page shows, because the
+    The long side of the image has at most `side` pixels: as many as the page shows, because the
     browser has to decode each of them.
     """
     about = {"layer": layer, "sent": 1e3 * time.time(), **shown.about}
     jpeg = b""
     if shown.image is not None:
-        # The score of a frame is known already: without a background none is computed again.
-        gel = shown.gel if layer != LAYERS[0] else None
-        view, score = touch_layer(shown.image, gel, about["threshold"], layer)
-        if score != score or (layer in MEASURED and shown.fields is None):
-            about["layer"] = LAYERS[0]
-        elif layer in MEASURED and shown.fields is not None:
-            view = measured_layer(view, shown.fields, layer)
+        view, about["layer"] = _view(shown.image, shown, layer)
         jpeg = encode(scale_down(view, side), ".jpg", cv2.IMWRITE_JPEG_QUALITY, _QUALITY)
     text = json.dumps(about).encode()
     return struct.pack("<I", len(text)) + text + struct.pack("<I", len(jpeg)) + jpeg
+
+
+def _view(image: Array, shown: Shown, layer: str) -> tuple[Array, str]:
+    """Return a layer of a frame, and its name. Without a background it is the frame itself.
+
+    The contact score is known already, so only a layer that shows the difference compares the
+    frame with its background again.
+    """
+    frame = scale_down(image)
+    if layer == LAYERS[0] or (layer in MEASURED and shown.fields is None):
+        return frame, LAYERS[0]
+    if shown.fields is not None and layer in MEASURED:
+        return measured_layer(frame, shown.fields, layer), layer
+    view, score = touch_layer(image, shown.gel, shown.about["threshold"], layer)
+    return view, layer if score == score else LAYERS[0]

@@ -4,7 +4,7 @@
 const COLOURS = ["#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377", "#ee7733", "#009988", "#882255",
   "#999933", "#88ccee", "#cc6677", "#117733", "#ddcc77", "#332288", "#44aa99", "#661100", "#6699cc", "#aa4466",
   "#4b7d2c", "#888888"];
-const RATE = 10, AHEAD = 6, KEPT = 900; // frames a second of recordings, frames read ahead, pictures in memory
+const RATE = 10, AHEAD = 6, KEPT = 900; // frames a second of recordings, frames read ahead, images in memory
 const DASHES = [[], [7, 3], [2, 3], [9, 3, 2, 3]]; // lines differ by more than their colour
 const LAYERS = { frame: "Image", difference: "Difference", contact: "Contact", depth: "Depth", surface: "Surface" };
 const main = document.getElementById("main"), tabs = document.getElementById("tabs");
@@ -46,6 +46,9 @@ const order = (source, body, more = {}) => api(`${source}/control`, {
   method: "POST", body: JSON.stringify(body), headers: { "X-Anytouch": "1" }, ...more,
 });
 
+// A command, which is broken between words and never inside an option such as --out.
+const command = (text) => el("code", {}, ...text.split(" ").flatMap((word, i) => (i ? [" ", el("span", {}, word)] : [el("span", {}, word)])));
+
 function option(label, values, value, change) {
   const node = el("select", { ariaLabel: label, onchange: () => change(node.value) });
   for (const [key, text] of values) node.append(el("option", { value: key }, text));
@@ -53,7 +56,7 @@ function option(label, values, value, change) {
   return el("label", {}, label, node);
 }
 
-// Buttons that choose the layer of all pictures. Key `l` takes the next one.
+// Buttons that choose the layer of all images. Key `l` takes the next one.
 function layerBar(names, change) {
   const buttons = names.map((name) => el("button", { onclick: () => choose(name) }, LAYERS[name] ?? name));
   const node = el("div", { className: "layers", role: "group", ariaLabel: "layer" }, ...buttons);
@@ -80,9 +83,9 @@ document.addEventListener("keydown", (event) => {
   action();
 });
 
-// ---- pictures ----------------------------------------------------------------------------------------------------
+// ---- images ------------------------------------------------------------------------------------------------------
 
-class Pictures {
+class Images {
   // `path` leads to the rows of a source. A fixed `layer` does not follow the buttons.
   constructor(path, layer = null, inTurn = false) { Object.assign(this, { path, layer, inTurn, held: new Map(), last: null }); }
   get(row) {
@@ -114,7 +117,7 @@ class Pictures {
     return canvas;
   }
 }
-const framesOf = (table, layer, inTurn) => new Pictures(`${table}/frame`, layer, inTurn);
+const framesOf = (table, layer, inTurn) => new Images(`${table}/frame`, layer, inTurn);
 
 function paint(canvas, bitmap) {
   if (canvas.width !== bitmap.width || canvas.height !== bitmap.height) {
@@ -124,12 +127,12 @@ function paint(canvas, bitmap) {
   canvas.getContext("2d").drawImage(bitmap, 0, 0);
 }
 
-// A row of a source as a small picture that is a button.
-function thumbnail(pictures, row, caption, open, title = "") {
-  return el("button", { onclick: open, title }, el("figure", {}, pictures?.image(row, caption) ?? null, el("figcaption", {}, caption)));
+// A row of a source as a small image that is a button.
+function thumbnail(images, row, caption, open, title = "") {
+  return el("button", { onclick: open, title }, el("figure", {}, images?.image(row, caption) ?? null, el("figcaption", {}, caption)));
 }
 
-async function picture(path, alt) {
+async function imageOf(path, alt) {
   const image = el("img", { alt });
   const address = URL.createObjectURL(await (await api(path)).blob());
   image.onload = () => URL.revokeObjectURL(address);
@@ -137,7 +140,7 @@ async function picture(path, alt) {
   return image;
 }
 
-// Contact is a change of the picture in grey levels, of which there are 255.
+// Contact is a change of the image in grey levels, of which there are 255.
 const CONTACT = "contact, %";
 const inPercent = (levels) => (levels === null || levels === undefined ? null : levels / 2.55);
 
@@ -252,7 +255,7 @@ function describe(clip, title) {
   return list;
 }
 
-function clipCard(source, clip, pictures, title) {
+function clipCard(source, clip, images, title) {
   const canvas = el("canvas", { role: "img", ariaLabel: `touch by ${clip.sensor ?? "this sensor"}` });
   const contact = el("span", { className: "soft" }), scores = clip.rows.map(() => null), force = forceBar(), measured = {};
   const words = el("div", { className: "column" }, force.node, describe(clip, title));
@@ -260,19 +263,19 @@ function clipCard(source, clip, pictures, title) {
     el("div", { className: "bar" }, clip.sensor ? el("h3", {}, clip.sensor) : null, contact), words);
   if (clip.photo) {
     guard(async () => {
-      const image = await picture(`${source}/photo/${clip.rows[0]}`, "RGB image of the object");
+      const image = await imageOf(`${source}/photo/${clip.rows[0]}`, "RGB image of the object");
       node.append(el("figure", { className: "photo" }, image, el("figcaption", {}, "RGB image")));
     })();
   }
   const load = async (t) => {
-    const at = Math.min(t, clip.rows.length - 1), one = pictures.get(clip.rows[at]);
+    const at = Math.min(t, clip.rows.length - 1), one = images.get(clip.rows[at]);
     if (!one.ready) await one.wait;
     if (one.score !== undefined) scores[at] = one.score;
     for (const [name, value] of Object.entries(one.fields?.curves ?? {})) (measured[name] ??= clip.rows.map(() => null))[at] = value;
     return one;
   };
   const show = async (t) => {
-    for (let next = t + 1; next <= Math.min(t + AHEAD, clip.rows.length - 1); next++) pictures.get(clip.rows[next]);
+    for (let next = t + 1; next <= Math.min(t + AHEAD, clip.rows.length - 1); next++) images.get(clip.rows[next]);
     const one = await load(t), score = one.score ?? null;
     if (one.bitmap) showLayer(canvas, one.bitmap, one.isSurface ? one.fields : null);
     force.show(one.fields, one.isSurface ? "surface" : state.layer);
@@ -331,14 +334,14 @@ function timeline(cards, length, seek) {
 
 const MANY = 12; // touches from which their thumbnails are shown first
 
-// Thumbnails of the touches that pass the filters. Pictures are read when they come into view.
+// Thumbnails of the touches that pass the filters. Images are read when they come into view.
 function touchGrid(source, filters, open) {
-  const pictures = framesOf(source, "frame"), tiles = el("div", { className: "thumbs" }), more = el("button", {}, "Show more");
+  const images = framesOf(source, "frame"), tiles = el("div", { className: "thumbs" }), more = el("button", {}, "Show more");
   const node = el("div", { className: "column" }, tiles, more);
   let shown = 0, asked = 0;
   const seen = new IntersectionObserver((entries) => entries.filter((entry) => entry.isIntersecting).forEach(({ target }) => {
     seen.unobserve(target);
-    target.querySelector("figure").prepend(pictures.image(Number(target.dataset.row), target.dataset.name));
+    target.querySelector("figure").prepend(images.image(Number(target.dataset.row), target.dataset.name));
     target.querySelector(".blank").remove();
   }), { rootMargin: "200px" });
   const load = guard(async (start) => {
@@ -362,7 +365,7 @@ function touchGrid(source, filters, open) {
 }
 
 function showTable(source, about, start = null) {
-  const pictures = framesOf(source), filters = {}, clips = el("div", { className: "clips" }), below = el("div", { className: "column" });
+  const images = framesOf(source), filters = {}, clips = el("div", { className: "clips" }), below = el("div", { className: "column" });
   const look = el("div", { className: "look" }, clips, below);
   let place = start ?? 0, count = 0, isGrid = start === null && about.touches > MANY, cards = [], t = 0, length = 1, timer = null, asked = 0, busy = false, axis = timeline([], 1);
   const title = el("h2"), subtitle = el("p", { className: "soft small" }), number = el("input", { type: "number", min: 1, value: 1, ariaLabel: "number of the touch", onchange: () => go(number.value - 1) });
@@ -405,7 +408,7 @@ function showTable(source, about, start = null) {
     const named = found.clips?.[0]?.object ?? found.name;
     title.textContent = count ? named : "No touch passes these filters.";
     subtitle.textContent = named === found.name ? "" : found.name ?? "";
-    cards = found.clips.map((clip) => clipCard(source, clip, pictures, named));
+    cards = found.clips.map((clip) => clipCard(source, clip, images, named));
     length = Math.max(1, ...found.clips.map((clip) => clip.rows.length));
     axis = timeline(cards, length, (at) => { pause(); move(at); });
     axis.playing.addEventListener("click", () => (timer ? pause() : play()));
@@ -473,8 +476,7 @@ function showTable(source, about, start = null) {
 // ---- start -------------------------------------------------------------------------------------------------------
 
 function showStart(source, about) {
-  const examples = state.sources.findIndex((one) => one.kind === "table"), thumbs = el("div", { className: "thumbs" });
-  thumbs.style.setProperty("--thumb", "min(48%, 172px)"); // six in a row, or three, or two
+  const examples = state.sources.findIndex((one) => one.kind === "table"), thumbs = el("div", { className: "thumbs six" });
   const open = guard(async (camera) => {
     say("Opening the camera and its encoder. This takes some seconds.");
     const { source: place } = await (await order(source, { camera })).json();
@@ -485,7 +487,7 @@ function showStart(source, about) {
   const cameras = Object.entries(about.cameras).map(([number, name]) => el("li", { className: "bar" },
     el("span", {}, el("b", {}, `Camera ${number}`), ` ${name}`), el("button", { className: "main push", onclick: () => open(number) }, `Open camera ${number}`)));
   const found = cameras.length ? [el("ul", { className: "steps" }, ...cameras)] : [el("p", {}, "No camera was found. Plug in a sensor, then look again.")];
-  const step = (text, command) => el("li", {}, el("p", {}, text), el("code", {}, command));
+  const step = (text, words) => el("li", {}, el("p", {}, text), command(words));
   const example = el("button", { className: cameras.length ? "" : "main", onclick: () => open(about.example) }, "Play the built-in recording");
   main.replaceChildren(el("h2", {}, "What do you want to see?"), el("div", { className: "split" },
     el("div", { className: "column" },
@@ -498,10 +500,10 @@ function showStart(source, about) {
       step("Features and their map", "anytouch view manifest.parquet features.npz")))),
     el("h3", {}, "Two presses, each by three sensors"), thumbs);
   guard(async () => {
-    const pictures = framesOf(examples, "frame"), { touches } = state.sources[examples].about;
+    const images = framesOf(examples, "frame"), { touches } = state.sources[examples].about;
     for (let place = 0; place < touches; place++) {
       const { clips, name } = await json(`${examples}/touch?place=${place}`);
-      thumbs.append(...clips.map((clip) => thumbnail(pictures, clip.rows[0], `${name}, ${clip.sensor}`, () => select(examples, place))));
+      thumbs.append(...clips.map((clip) => thumbnail(images, clip.rows[0], `${name}, ${clip.sensor}`, () => select(examples, place))));
     }
   })();
   keys([]);

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 LOCAL = ("127.0.0.1", "localhost", "::1")
 # of every request that changes something: another site would need CORS to send it
 HEADER = "x-anytouch"
-SMALLEST = 64  # pixels of the long side of a live picture
+SMALLEST = 64  # pixels of the long side of a live image
 _SCRIPTS = ("page.js", "fields.js", "space.js", "live.js")
 _SHARED = "theme.css"  # with reports, so it lies in the package's root
 _ASSETS = (

@@ -31,6 +31,7 @@ class Setup(NamedTuple):
         small: the background, scaled down, and ready to be compared.
         preprocess: makes the encoder's input of a turned frame.
         measure: measures depth and force, None if the encoder does not.
+        note: a sentence on a background that does not fit a calibrated sensor, or "".
     """
 
     rotate: int
@@ -40,6 +41,7 @@ class Setup(NamedTuple):
     small: tuple[Array, UntouchedBackground] | None
     preprocess: Preprocess
     measure: Measure | None
+    note: str = ""
 
     def turned(self, image: Array) -> Array:
         """Return an image as read, turned."""
@@ -62,7 +64,8 @@ def make_setup(
 ) -> Setup:
     """Return a setup with a background.
 
-    A background that does not fit a calibrated sensor is logged, and then nothing is measured.
+    A background that does not fit a calibrated sensor is logged, and is the setup's note. Of another
+    gel deviations are wider, and of another device nothing is measured.
 
     Args:
         encoder: what frames are prepared for.
@@ -79,13 +82,18 @@ def make_setup(
     if gel is not None:
         small = scale_down(gel), UntouchedBackground(gel)
     measure = None
+    said = list[str]()
     if encoder.measures:
         try:
-            measure = encoder.measure_of(sensor, gel, log=lambda _: None)
+            measure = encoder.measure_of(sensor, gel, log=said.append)
         except UserError as error:
-            log(str(error))
+            said.append(str(error))
+    # What `measure` says later is of a frame, and stands in its fields.
+    note = " ".join(said)
+    if note:
+        log(note)
     # Frames are turned before, so the encoder's preprocessing does not.
-    return Setup(rotate, flip, running, gel, small, Preprocess(encoder, gel), measure)
+    return Setup(rotate, flip, running, gel, small, Preprocess(encoder, gel), measure, note)
 
 
 def measure_last(

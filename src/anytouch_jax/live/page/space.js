@@ -3,16 +3,16 @@
 
 // ---- features ----------------------------------------------------------------------------------------------------
 
-function hitCard(hit, pictures, open) {
+function hitCard(hit, images, open) {
   const text = [hit.about.object, hit.about.sensor, hit.cosine?.toFixed(3)].filter((part) => part).join(", ");
   const all = Object.entries(hit.about).map((pair) => pair.join(": ")).join("\n");
-  return thumbnail(pictures, hit.table_row, text, open, all);
+  return thumbnail(images, hit.table_row, text, open, all);
 }
 
 function showSpace(source, about) {
   let points = null, colours = null, chosen = -1, method = "pca", timer = null, marked = [];
   let column = ["object", "sensor"].find((name) => about.columns.includes(name)) ?? about.columns[0] ?? "";
-  const pictures = about.table === null ? null : framesOf(about.table, "frame");
+  const images = about.table === null ? null : framesOf(about.table, "frame");
   const names = el("div", { className: "legend small" }), side = el("div", { className: "column" });
   const others = el("input", { type: "checkbox", checked: about.sensors > 1 });
   const map = el("canvas", { className: "map", tabIndex: 0, role: "img",
@@ -56,11 +56,11 @@ function showSpace(source, about) {
     }
     clearInterval(timer);
     const parts = [];
-    if (pictures) {
+    if (images) {
       const canvas = el("canvas", { role: "img", ariaLabel: "the chosen touch" }), touch = await json(`${about.table}/touch?row=${found.row.table_row}`);
       const clip = touch.clips.find((each) => each.rows.includes(found.row.table_row)) ?? touch.clips[0];
       let t = clip.rows.indexOf(found.row.table_row);
-      const draw = (row) => { const one = pictures.get(row); if (one.bitmap) paint(canvas, one.bitmap); return one; };
+      const draw = (row) => { const one = images.get(row); if (one.bitmap) paint(canvas, one.bitmap); return one; };
       draw(found.row.table_row).wait.then(() => draw(found.row.table_row));
       timer = setInterval(() => {
         if (!draw(clip.rows[(t = (t + 1) % clip.rows.length)]).ready) t--;
@@ -69,7 +69,7 @@ function showSpace(source, about) {
     } else {
       parts.push(el("p", { className: "soft" }, "Name the manifest too, and you see the images."));
     }
-    const cards = found.hits.map((hit) => hitCard(hit, pictures, pictures ? open(hit) : () => choose(points.rows.indexOf(hit.row))));
+    const cards = found.hits.map((hit) => hitCard(hit, images, images ? open(hit) : () => choose(points.rows.indexOf(hit.row))));
     side.replaceChildren(el("h3", {}, found.row.about.object || `Row ${found.row.row}`), list, ...parts,
       el("h3", {}, `${cards.length} nearest, of ${others.checked ? "other sensors" : "other recordings"}`),
       el("div", { className: "thumbs" }, ...cards));
@@ -160,7 +160,7 @@ function showRun(source) {
   };
   const figure = guard(async (name) => {
     shown = name;
-    wide.replaceChildren(await picture(`${source}/figure/${encodeURIComponent(name)}`, name));
+    wide.replaceChildren(await imageOf(`${source}/figure/${encodeURIComponent(name)}`, name));
   });
   const poll = async () => {
     try {

@@ -62,6 +62,7 @@ class Teacher:
         self._looked = 0.0
         self._was_longer = False
         self._training = threading.Lock()
+        self._counting = threading.Lock()  # threads of several pages, of the camera and of training
         self._fault = ""
         self.longer = LongerTraining(encoder, recorder, log)
         self.reload()
@@ -79,7 +80,11 @@ class Teacher:
         self._stamp = manifest.stamp()
         if self._stamp is not None:
             self.table = Table(manifest.read(), self._recorder.out.name)
-        self.version += 1
+        self._changed()
+
+    def _changed(self) -> None:
+        with self._counting:
+            self.version += 1
 
     def look(self) -> None:
         """Raise the version if another page has changed the manifest.
@@ -91,12 +96,12 @@ class Teacher:
             self._looked = now
             if self.longer.is_on or self._was_longer:
                 # The page shows the time left, and then the result.
-                self.version += 1
+                self._changed()
             self._was_longer = self.longer.is_on
             stamp = self._recorder.manifest.stamp()
             if stamp not in (self._stamp, self._noticed):
                 self._noticed = stamp
-                self.version += 1
+                self._changed()
 
     def about(self) -> dict[str, Any]:
         """Return the names with their recordings, what is known of the head, and what it lacks."""
@@ -145,6 +150,7 @@ class Teacher:
         if not self._training.acquire(blocking=False):
             raise UserError("A head is being trained already.")
         self.longer.forget()
+        self._changed()  # the page says that it trains
         threading.Thread(target=self._train, daemon=True).start()
 
     def train_longer(self) -> None:
@@ -191,7 +197,7 @@ class Teacher:
             self._fault = str(error)
         finally:
             self._training.release()
-            self.version += 1
+            self._changed()
 
     def _fit(self, table: Manifest) -> None:
         """Fit a head and let it name live touch, then measure it."""

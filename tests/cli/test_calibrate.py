@@ -84,7 +84,7 @@ def test_forces_come_from_a_column_too(place, capsys, monkeypatch):
     assert calibrate(*more, "--newton", "forces.csv") == 0
     assert "2 presses of 2 to 3.5 N" in capsys.readouterr().err
     Path("forces.csv").write_text("frame,newton\nother.png,2\n")
-    assert calibrate(*more, "--newton", "forces.csv") == 2
+    assert calibrate("--sensor", "weighed.sensor", "--newton", "forces.csv") == 2
     assert "other.png of it is not among the images" in capsys.readouterr().err
 
 

@@ -2,6 +2,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from threadpoolctl import ThreadpoolController
 
 from anytouch_jax.encoder import calibration, linear_head
 from anytouch_jax.encoder import calibration as novelty
@@ -235,3 +236,20 @@ def test_confidence_is_not_above_what_the_groups_support(columns):
     confidence = linear_head.probabilities(logits, found).max(1).mean()
     assert found > 0.05 and confidence == pytest.approx(8 / 9, abs=1e-6)
     assert calibration.modest_temperature(logits, groups, 2 * found) == 2 * found
+
+
+def test_whitening_has_one_thread_beside_a_live_page(monkeypatch):
+    libraries = ThreadpoolController()
+    plain = np.linalg.eigh
+    seen = []
+
+    def counted(matrix):
+        seen.append({one["num_threads"] for one in libraries.info()})
+        return plain(matrix)
+
+    monkeypatch.setattr(np.linalg, "eigh", counted)
+    x, _, groups, _ = touches(np.random.default_rng(0), 10)
+    with libraries.limit(limits=2):
+        novelty.left_out_scores(x, groups)
+        after = {one["num_threads"] for one in libraries.info()}
+    assert seen == [{1}] * 5 and after == {2}

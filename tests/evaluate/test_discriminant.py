@@ -5,9 +5,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.linalg import eigh
 from task_world import blobs
+from threadpoolctl import ThreadpoolController
 
-from anytouch_jax.evaluate import heads, logistic
+from anytouch_jax.evaluate import discriminant, heads, logistic
 from anytouch_jax.evaluate.array_probes import probe_features
 from anytouch_jax.evaluate.discriminant import discriminant_path
 from anytouch_jax.evaluate.heads import ProbeHead, fit_head, linear_path, vote
@@ -53,6 +55,23 @@ def test_it_names_as_many_as_logistic_regression():
     fast = linear_path(x[~test], y[~test], heads.PENALTIES, total=heads.MANY_CLASSES + 1)
     best = [max(np.mean(one(x[test]) == y[test]) for one in path) for path in (exact, fast)]
     assert 0.5 < best[0] < best[1] + 0.02
+
+
+def test_the_factorisation_has_one_thread_and_leaves_the_others_as_they_were(monkeypatch):
+    """Several wait for each other on a busy machine, where it took 30 times as long."""
+    libraries = ThreadpoolController()
+    seen = []
+
+    def counted(matrix):
+        seen.append({one["num_threads"] for one in libraries.info()})
+        return eigh(matrix)
+
+    monkeypatch.setattr(discriminant, "eigh", counted)
+    x, y = blobs(200, classes=5)
+    with libraries.limit(limits=2):
+        list(discriminant_path(x, y, 5, [0.1]))
+        after = {one["num_threads"] for one in libraries.info()}
+    assert seen == [{1}] and after == {2}
 
 
 def test_the_kind_of_head_goes_by_the_classes_of_the_probe_not_of_a_fold(monkeypatch):

@@ -92,13 +92,22 @@ def run(options: CalibrateOptions) -> int:
 
 def _place(options: CalibrateOptions) -> Path:
     """Return the folder to write. Raises UserError."""
+    from anytouch_jax.sim.sensing.own import NUMBERS
+
     out = options.out
     if out is None:
         if Path(options.sensor).suffix != OWN_SENSOR:
             raise UserError(f"name the folder to write: --out mine{OWN_SENSOR}")
         out = Path(options.sensor)
     check_home(out)
-    return out.expanduser()
+    out = out.expanduser()
+    is_further = Path(options.sensor).expanduser().resolve() == out.resolve()
+    if (out / NUMBERS).exists() and not is_further:
+        raise UserError(
+            f"{out} is a sensor already, whose numbers would be lost. Calibrate it further with "
+            f"--sensor {out}, or name another --out."
+        )
+    return out
 
 
 def _read(options: CalibrateOptions) -> tuple[list[Path], np.ndarray, list[np.ndarray]]:

@@ -36,6 +36,9 @@ if TYPE_CHECKING:
     from anytouch_jax.sim.scene import Scenes
 
 
+Portion = Annotated[float | None, Range(0, 1, "0 to 1")]
+
+
 @dataclass(frozen=True)
 class _OutputFolder:
     """The first option of `SimulateOptions`: a base of its own, so that it has no default."""
@@ -166,10 +169,14 @@ class DatasetOptions:
     out: Path | None = None
     # Keep your edits of the manifest OUT: columns, splits, texts and labels, matched by path.
     keep: bool = False
-    # Fraction of the objects or recordings in split val, for a dataset without splits.
-    val: Ratio = 0.05
-    # Fraction of the objects or recordings in split test, for a dataset without splits.
-    test: Ratio = 0.05
+    val: Portion = None
+    """Fraction of the objects or recordings in split val, for a dataset without splits (default:
+    0.05. recordings, hdf5, zarr: of fewer than 100, 5 of them, but at most a tenth).
+    """
+    test: Portion = None
+    """Fraction of the objects or recordings in split test, for a dataset without splits (default:
+    0.05. recordings, hdf5, zarr: of fewer than 200, 10 of them, but at most a fifth).
+    """
     lists: Path | None = None  # Folder of the dataset's list files, if they are not in ROOT.
     # touch_and_go: the task whose lists decide the split.
     task: Literal["material", "rough"] = "material"

@@ -28,7 +28,8 @@ class FitOptions:
     Press all kinds of objects into the gel, at changing places, and add a few images of the
     untouched gel. The folder has readable numbers (sensor.json), which say how sure each is, and
     real next to simulated images (look.png). `data simulate --sensors`, `train
-    --simulated.sensors` and `adapt --sensor` take it like the name of a sensor.
+    --simulated.sensors` and `adapt --sensor` take it like the name of a sensor. A folder whose
+    numbers you edited or calibrated is not written over.
     """
 
     # Folder of images of one unit, upright and not cropped.
@@ -47,10 +48,12 @@ def run_fit(options: FitOptions) -> int:
     from anytouch_jax.data.images import decode, list_images, to_rgb
     from anytouch_jax.sim.fitting.fit import check_name, fit_sensor
     from anytouch_jax.sim.fitting.touches import compare
+    from anytouch_jax.sim.sensing.own import check_unedited
     from anytouch_jax.train.mesh import enable_compilation_cache
 
     check_name(options.name)
     check_home(options.out)
+    check_unedited(options.out)
     enable_compilation_cache()
     files, named = list_images(options.frames)
     background = options.background or named.get("background")

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.optimize import brentq, minimize_scalar
 from scipy.special import expit, log_softmax, softmax
+from threadpoolctl import threadpool_limits
 
 from anytouch_jax.encoder.arrays import Array
 from anytouch_jax.errors import UserError
@@ -471,7 +472,9 @@ def reference_space(x: Array, groups: Array) -> tuple[Array, Array, Array]:
     """
     width = x.shape[1]
     covariance = np.cov(x.astype(np.float64), rowvar=False).reshape(width, width)
-    values, vectors = np.linalg.eigh(covariance)
+    # One thread: beside a live page several wait for each other, which took ten times as long.
+    with threadpool_limits(1):
+        values, vectors = np.linalg.eigh(covariance)
     # A hundredth of the mean variance is a tenth of the spread.
     spread = np.sqrt(np.maximum(values, 0) + max(0.01 * values.mean(), 1e-12))
     whitening = np.asarray(vectors / spread, np.float32)

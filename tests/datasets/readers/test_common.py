@@ -82,3 +82,11 @@ def test_hash_splits_are_stable_disjoint_and_of_the_wanted_fraction():
     )
     assert {hash_split("x", f"o{k}", IndexOptions(0, 0)) for k in range(50)} == {"train"}
     assert {hash_split("x", f"o{k}", IndexOptions(0, 1)) for k in range(50)} == {"test"}
+
+
+def test_a_split_by_hash_that_tests_few_is_noted(tmp_path, read):
+    fill_ycb(tmp_path, ("a", "b", "c"), 2)
+    assert "split test has 0 of 3 objects" in " ".join(read("ycb_slide", tmp_path).report.notes)
+    fill_ycb(tmp_path, [f"o{k}" for k in range(30)], 2)
+    some = read("ycb_slide", tmp_path, test=0.5).report
+    assert "split test has" not in " ".join(some.notes)

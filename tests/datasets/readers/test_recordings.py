@@ -88,6 +88,48 @@ def test_ranked_splits_have_their_fractions_and_hardly_move():
     assert set(ranked_split(names, IndexOptions(0, 0)).values()) == {"train"}
 
 
+def test_by_default_few_recordings_give_enough_to_test_on():
+    counts = {}
+    for n in (3, 6, 24, 50, 100, 200, 1000):
+        parts = list(ranked_split(map(str, range(n)), IndexOptions()).values())
+        counts[n] = (parts.count("val"), parts.count("test"))
+    assert counts == {
+        3: (1, 1),
+        6: (1, 1),
+        24: (2, 5),
+        50: (5, 10),
+        100: (5, 10),
+        200: (10, 10),
+        1000: (50, 50),
+    }
+    # a fraction that is given stays, and the other one leaves it room
+    given = list(ranked_split(map(str, range(24)), IndexOptions(test=0.05)).values())
+    assert (given.count("val"), given.count("test")) == (2, 1)
+    assert IndexOptions(test=1.0).shares(24) == (0.0, 1.0)
+    assert IndexOptions(val=0.95).shares(24) == pytest.approx((0.95, 0.05))
+
+
+@pytest.mark.parametrize(
+    ("takes", "options", "words"),
+    [
+        (8, {}, ""),  # 24 recordings: 6 of them
+        (8, {"test": 0.05}, "split test has 3 of 24"),
+        (8, {"test": 0.0}, ""),
+        (2, {}, "split test has 3 of 6"),
+        (8, {"split_by": "object"}, "split test has 1 of 3"),
+    ],
+)
+def test_few_to_test_on_are_noted_with_what_to_do(tmp_path, read, takes, options, words):
+    fill(tmp_path, [f"thing {n}/{k}/0.png" for n in range(3) for k in range(takes)])
+    settings = {"split_by": "recording"} | options
+    notes = read("recordings", tmp_path, sensor="digit", **settings).report.notes
+    (note,) = [note for note in notes if "split test has" in note] or [""]
+    assert note.startswith(words) and bool(note) == bool(words)
+    if words:
+        column = "object" if "split_by" in options else "sequence"
+        assert "--test 0.3" in note and f"--leave-out {column}" in note
+
+
 def test_by_recording_every_object_is_in_every_split(tmp_path, read):
     fill(
         tmp_path,

@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 
+from anytouch_jax.cli.app import main
 from anytouch_jax.errors import UserError
 from anytouch_jax.sim import endless
 from anytouch_jax.sim.scene import Scenes, draw_recording, draw_touch
@@ -47,6 +48,41 @@ def test_it_is_read_as_it_was_written_and_again_when_it_changes(folder):
         bases(find_sensor(str(folder)))[0, 0, 0, 0] == np.float32(50 / 255)
         and "mine" not in SENSORS
     )
+
+
+def test_a_fit_goes_over_its_own_numbers_in_any_layout(folder):
+    own.check_unedited(folder)
+    own.check_unedited(folder.with_name("new.sensor"))
+    file = folder / own.NUMBERS
+    file.write_text(json.dumps(dict(reversed(json.loads(file.read_text()).items())), indent=8))
+    own.check_unedited(folder)
+
+
+@pytest.mark.parametrize("change", [{"thickness_mm": 2.5}, {"written": None}, "by hand", "more"])
+def test_a_fit_loses_no_edit(folder, capsys, change):
+    file = folder / own.NUMBERS
+    numbers = json.loads(file.read_text())
+    if change == "by hand":
+        file.write_text(file.read_text() + "}")  # a slip of the editor
+    elif change == "more":
+        del numbers["written"]  # as an earlier version wrote it
+        file.write_text(json.dumps(numbers))
+    else:
+        file.write_text(json.dumps(numbers | change))
+    before = file.read_bytes()
+    command = ["sensor", "fit", str(folder), "--name", "mine", "--width-mm", "18", "--out"]
+    assert main([*command, str(folder)]) == 2
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert "was edited or calibrated" in said and "another --out" in said
+    assert file.read_bytes() == before
+
+
+def test_a_calibration_keeps_the_numbers_that_are_there(folder, capsys):
+    before = (folder / own.NUMBERS).read_bytes()
+    command = ["sensor", "calibrate", str(folder), "--ball-mm", "6", "--out", str(folder)]
+    assert main([*command, "--sensor", "digit"]) == 2
+    assert f"further with --sensor {folder}" in capsys.readouterr().err
+    assert (folder / own.NUMBERS).read_bytes() == before
 
 
 def test_one_device_varies_less_than_a_product(folder):

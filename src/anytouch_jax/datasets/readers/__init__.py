@@ -137,7 +137,7 @@ def index(
     """
     if name not in READERS:
         near = difflib.get_close_matches(name.lower().replace("-", "_"), READERS, 1, 0.4)
-        guess = f"; did you mean {near[0]}?" if near else ""
+        guess = f"; did you mean {near[0]}?" if near else "."
         raise UserError(f"no reader is called {name!r}{guess} There are: {', '.join(READERS)}")
     reader = READERS[name]
     options = options or IndexOptions()
@@ -165,6 +165,7 @@ def index(
     target = _target(base, stem, out)
     rows = DatasetIndex(name, base, replace(options, lists=lists), file)
     reader.read(rows)
+    rows.note_on_few()
     columns = rows.columns()
     size = len(columns["path"])
     if not size:

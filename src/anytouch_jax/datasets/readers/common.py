@@ -56,6 +56,13 @@ MOST_LABELS = 1000  # of one value
 # in names of cameras and fields
 TACTILE = re.compile(r"tactile|gelsight|digit|touch|gel(?![a-z])", re.IGNORECASE)
 PARTS = ("train", "val", "test")  # published splits
+# Fraction of val and of test that is held out by default.
+HELD_OUT = 0.05
+# Where that is few objects or recordings, so many are held out, up to a fraction.
+_VAL = (5, 0.1)
+_TEST = (10, 0.2)
+# A score on fewer objects or recordings than this is reported as saying little.
+FEWEST_TESTED = 5
 NUMBERED = r"(\d+)\.(?:png|jpe?g)"
 EXPORT_RECORD = ".anytouch.json"  # in a folder of images that a reader has written
 SYSTEM_FILES = ("Thumbs.db", "desktop.ini", "__MACOSX")
@@ -86,8 +93,8 @@ class IndexOptions:
     Each reader names those that it uses.
     """
 
-    val: float = 0.05
-    test: float = 0.05
+    val: float | None = None
+    test: float | None = None
     lists: Path | None = None
     task: Literal["material", "rough"] = "material"
     fold: int = 0
@@ -103,11 +110,33 @@ class IndexOptions:
     values: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        if not (0 <= self.val <= 1 and 0 <= self.test <= 1 and self.val + self.test <= 1):
+        val = self.val or 0
+        test = self.test or 0
+        if not (0 <= val <= 1 and 0 <= test <= 1 and val + test <= 1):
             raise UserError(
-                f"val {self.val} and test {self.test} are shares: both at least 0, together at "
-                "most 1"
+                f"val {val} and test {test} are shares: both at least 0, together at most 1"
             )
+
+    def shares(self, groups: int | None = None) -> tuple[float, float]:
+        """Return the fractions of val and test.
+
+        By default both are 5 %. Of so few objects or recordings that this says nothing, more are
+        held out, if their number is known: `groups`.
+        """
+        val = self.val
+        test = self.test
+        if test is None:
+            test = min(_share(groups, *_TEST), 1 - (val or 0))
+        if val is None:
+            val = min(_share(groups, *_VAL), 1 - test)
+        return val, test
+
+
+def _share(groups: int | None, count: int, most: float) -> float:
+    """Return the fraction that `count` of `groups` are, of HELD_OUT to `most`."""
+    if not groups:
+        return HELD_OUT
+    return min(max(count / groups, HELD_OUT), most)
 
 
 @dataclass(frozen=True)
@@ -152,6 +181,8 @@ class DatasetIndex:
         self.options = options or IndexOptions()
         self.skipped: dict[str, tuple[int, str]] = {}
         self.notes: list[str] = []
+        # the split of each object or recording that was drawn, not stated by the dataset
+        self.drawn: dict[str, str] = {}
         # columns whose values stay in one split
         self.keep_together = ["sequence", "object"]
         # the authors' list of contact frames: path -> its cells
@@ -332,7 +363,25 @@ class DatasetIndex:
 
     def split_of(self, group: str) -> str:
         """Return the hash split of a group (an object or a recording) of this dataset."""
-        return hash_split(self.name, group, self.options)
+        split = hash_split(self.name, group, self.options)
+        self.drawn[group] = split
+        return split
+
+    def note_on_few(self) -> None:
+        """Note that a drawn split has too few objects or recordings to test on."""
+        parts = list(self.drawn.values())
+        tested = parts.count("test")
+        wanted = self.options.test is None or self.options.test > 0
+        if not wanted or tested >= FEWEST_TESTED or len(parts) < 2:
+            return
+        if any("for split test" in note for note in self.notes):  # each class has one alone
+            return
+        column = "object" if "object" in self.keep_together and "object" in self.table else None
+        self.notes.append(
+            f"split test has {tested} of {len(parts)} objects or recordings, and a score on so few "
+            "says little: --test 0.3 holds out more, and `anytouch probe label --leave-out "
+            f"{column or 'sequence'}` tests each in turn"
+        )
 
     def read_captions(
         self, folder: str, key: Callable[[str], str]
@@ -459,11 +508,12 @@ def hash_split(dataset: str, group: str, options: IndexOptions) -> str:
 
     Other groups move none.
     """
+    val, test = options.shares()
     digest = hashlib.sha256(f"{dataset}/{group}".encode()).digest()
     fraction = int.from_bytes(digest[:8], "big") / 2**64
-    if fraction < options.val:
+    if fraction < val:
         return "val"
-    if fraction < options.val + options.test:
+    if fraction < val + test:
         return "test"
     return "train"
 

@@ -610,10 +610,13 @@ def _splits(
             pools.setdefault(str(recording.labels.get("object")), set()).add(episode)
         else:
             splits[episode] = split
+    total = sum(map(len, pools.values()))
     for pool in pools.values():
-        splits |= ranked_split(pool, index.options)
-    for split in ("val", "test") if pools else ():
-        if split not in splits.values() and getattr(index.options, split):
+        index.drawn |= ranked_split(pool, index.options, total)
+    splits |= index.drawn
+    shares = dict(zip(("val", "test"), index.options.shares(), strict=True))
+    for split in shares if pools else ():
+        if split not in splits.values() and shares[split]:
             index.notes.append(f"there are too few recordings for split {split}")
     if any(stated.values()):
         index.notes.append("the splits are those that the lists in mask/ state")

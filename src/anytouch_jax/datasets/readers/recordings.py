@@ -228,18 +228,22 @@ def _move_like_videos(index: DatasetIndex, recordings: list[_Recording]) -> bool
     )
 
 
-def ranked_split(groups: Iterable[str], options: common.IndexOptions) -> dict[str, str]:
+def ranked_split(
+    groups: Iterable[str], options: common.IndexOptions, total: int | None = None
+) -> dict[str, str]:
     """Return the split of every group, by rank: sorted by SHA-256, the first are val, the last
     test, the others train.
 
     The counts are the rounded shares. A share above 0 gets at least one group, if there are enough.
-    Another group moves at most one at each cut.
+    Another group moves at most one at each cut, if the shares are given. Those by default depend on
+    the number of groups, `total` if these are a part of them.
     """
     order = sorted(set(groups), key=lambda group: hashlib.sha256(group.encode()).digest())
-    most = max(0, len(order) - (options.val + options.test < 1))
-    test = min(most, max(round(options.test * len(order)), options.test > 0))
-    val = min(most - test, max(round(options.val * len(order)), options.val > 0))
-    if options.val and not val and test > 1:
+    val_share, test_share = options.shares(total or len(order))
+    most = max(0, len(order) - (val_share + test_share < 1))
+    test = min(most, max(round(test_share * len(order)), test_share > 0))
+    val = min(most - test, max(round(val_share * len(order)), val_share > 0))
+    if val_share and not val and test > 1:
         test = test - 1
         val = 1
     parts = ["val"] * val + ["train"] * (len(order) - val - test) + ["test"] * test
@@ -271,17 +275,19 @@ def _assign_splits(
     ranked = {
         group: split
         for pool in pools.values()
-        for group, split in ranked_split(pool, options).items()
+        for group, split in ranked_split(pool, options, len(objects)).items()
     }
+    index.drawn |= ranked
     table["split"] = [
         split or ranked[groups[part]] for part, split in zip(parts, given, strict=True)
     ]
-    if by == "object" and len(objects) > 1 and options.val + options.test > 0:
+    shares = dict(zip(("val", "test"), options.shares(), strict=True))
+    if by == "object" and len(objects) > 1 and sum(shares.values()) > 0:
         index.notes.append(
             "whole objects are held out; for a classifier of objects: --split-by recording"
         )
     for split in ("val", "test"):
-        if split not in table["split"] and getattr(options, split):
+        if split not in table["split"] and shares[split]:
             reason = "there are too few objects or recordings for" if objects else "no folder is of"
             index.notes.append(f"{reason} split {split}")
 

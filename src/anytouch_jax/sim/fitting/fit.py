@@ -193,11 +193,12 @@ def fit_sensor(
             strength of the colours and the thickness of the gel are found too.
 
     Raises:
-        UserError: For images that cannot be fitted.
+        UserError: For images that cannot be fitted, and for a folder whose numbers were edited.
     """
     check_name(name)
     if Path(out).suffix != OWN_SENSOR:
         raise UserError(f"{out} must end in {OWN_SENSOR}; choose another --out")
+    own.check_unedited(out)
     height, width = images[0].shape[:2]
     height_mm = width_mm * height / width
     if not all(MM.low <= side <= MM.high for side in (width_mm, height_mm)):

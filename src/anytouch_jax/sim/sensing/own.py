@@ -6,13 +6,14 @@ sensor, it takes such a folder too.
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 import zlib
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -74,6 +75,7 @@ class OwnSensor:
     force_spread: NotNegative[float] = 0.0
     force_encoder: str = ""
     sure: dict = field(default_factory=dict)
+    written: str = ""  # hash of the rest as `sensor fit` wrote it: another one is an edit
 
     def __post_init__(self) -> None:
         check(self)
@@ -170,8 +172,31 @@ def write_sensor(
     arrays = {name: np.asarray(value, np.float32) for name, value in look._asdict().items()}
     np.savez(data, allow_pickle=False, bases=np.asarray(bases, np.uint8), **arrays)
     atomic_write(path / ARRAYS, data.getvalue())
-    write_numbers(path / NUMBERS, numbers)
+    write_numbers(path / NUMBERS, replace(numbers, written=_hash(asdict(numbers))))
     return path
+
+
+def check_unedited(folder: str | Path) -> None:
+    """Raise UserError for a sensor that holds more than a fit: edits, or a calibration."""
+    file = Path(folder).expanduser() / NUMBERS
+    if not file.exists():
+        return
+    try:
+        numbers = parse_json(file.read_bytes())
+        as_fitted = numbers["written"] == _hash(numbers)
+    except (OSError, UserError, KeyError, TypeError):
+        as_fitted = False
+    if not as_fitted:
+        raise UserError(
+            f"{file} was edited or calibrated, and a new fit would lose that. Name another --out, "
+            "or remove the folder first."
+        )
+
+
+def _hash(numbers: dict[str, Any]) -> str:
+    """Return the hash of the values of sensor.json, however they are laid out in the file."""
+    values = {name: value for name, value in numbers.items() if name != "written"}
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def write_numbers(file: Path, numbers: OwnSensor) -> None:

@@ -26,6 +26,8 @@ HEAD, PIXELS, COMMONEST = "its head alone, in seconds", "a head on pixels", "the
 COLOURS = {PACKAGE: "#00656f", HEAD: "#6fb3ba", NOTHING: "#b4552d", PIXELS: "#8d969e"}
 GREY = "#8d969e"
 SHOWN = 8  # presses of a figure
+RELOAD = 10  # seconds: the first page waits for the last one
+DEEPEST = 1.0  # mm of the lightest colour
 
 
 class Findings(NamedTuple):
@@ -75,11 +77,17 @@ def first_report(out: Path) -> Path:
         section = Section(
             "Before any training: the depth of two presses",
             "The encoder in the package reads depth and force from the image of a press. Above "
-            "the presses, below their depth in mm.",
+            "are the images of two presses by three sensors, below is what it reads: violet is "
+            f"the untouched gel, and yellow is {DEEPEST:.0f} mm deep.",
             figure=path,
         )
-        lead = ["The demo is running. This page is written again when it has something to tell."]
-        return write_report(out, [section], title="What the demo learns", lead=lead)
+        lead = [
+            "In some minutes this page tells how well the encoder has learned to name shapes on a "
+            "sensor that it had never met.",
+            "It is training now, and the page appears by itself.",
+        ]
+        title = "Naming shapes on a sensor that the encoder has never met"
+        return write_report(out, [section], title=title, lead=lead, reload=RELOAD)
 
 
 def write_findings(found: Findings, out: Path, minutes: float) -> Path:
@@ -299,7 +307,7 @@ def _draw_examples(path: Path) -> None:
         shown = fields.at(*touch.frame.shape[:2])
         axes[0][column].imshow(touch.frame)
         axes[0][column].set_title(f"{touch.press}, {touch.sensor}", fontsize=8)
-        axes[1][column].imshow(shown.depth[0], cmap="viridis", vmin=0, vmax=1.0)
+        axes[1][column].imshow(shown.depth[0], cmap="viridis", vmin=0, vmax=DEEPEST)
         told = f"{shown.depth[0].max():.2f} mm, {fields.force[0, 2]:.1f} N"
         axes[1][column].set_xlabel(told, fontsize=8)
         for axis in (axes[0][column], axes[1][column]):

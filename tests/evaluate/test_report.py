@@ -119,6 +119,9 @@ def test_a_report_has_its_parts_in_order(tmp_path: Path) -> None:
         "Second\n\n![Second](figures/mine.png)\n"
     )
     assert [one.name for one in images_of(path)] == ["shot.png", "mine.png"]
+    assert html.count('<p class="figure" tabindex="0">') == 2 and "refresh" not in html
+    write_report(out, parts, reload=10)
+    assert '<meta http-equiv="refresh" content="10">' in (out / "report.html").read_text()
     plain = json.loads((out / "report.json").read_text())
     assert (plain["x"], plain["bad"], plain["list"], plain["path"]) == (0.5, None, [0, 1], "a")
     assert plain["part"]["title"] == "Second"

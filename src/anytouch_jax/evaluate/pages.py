@@ -25,6 +25,9 @@ h2 { font-size: var(--large); }
 .lead { display: grid; gap: 10px; }
 .lead p { max-width: 46em; }
 .lead h1 + p { font-size: 19px; line-height: 1.45; }
+.figure { overflow-x: auto; }
+.figure img { display: block; }
+@media (max-width: 700px) { .figure img { max-width: none; width: 700px; } }
 img { max-width: 100%; border-radius: 6px; background: #fff; justify-self: start; }
 table { border-collapse: collapse; display: block; overflow-x: auto; }
 th { text-align: left; font-weight: 600; color: var(--soft); }
@@ -56,6 +59,7 @@ def write_report(
     title: str = "Report",
     lead: Sequence[str] = (),
     numbers: Mapping[str, Any] | None = None,
+    reload: int = 0,
 ) -> Path:
     """Write report.html, report.md, report.json and the figures, and return the path of report.md.
 
@@ -67,6 +71,7 @@ def write_report(
         title: of the page.
         lead: paragraphs before the first section: what the report says, in words.
         numbers: of report.json.
+        reload: seconds after which a browser reads the page again, 0 for a page that is final.
 
     Raises:
         UserError: for a missing figure.
@@ -88,15 +93,16 @@ def write_report(
         text = json.dumps(plain(numbers), indent=2, allow_nan=False) + "\n"
         atomic_write(folder / "report.json", text)
     text = "\n\n".join(part.strip() for part in parts if part) + "\n"
-    atomic_write(folder / "report.html", html_page(text, folder, title))
+    atomic_write(folder / "report.html", html_page(text, folder, title, reload))
     atomic_write(folder / "report.md", text)
     return folder / "report.md"
 
 
-def html_page(text: str, folder: Path, title: str) -> str:
+def html_page(text: str, folder: Path, title: str, reload: int = 0) -> str:
     """Return Markdown as one HTML page with the images of `folder`/figures inside.
 
-    HTML in the Markdown is shown as text, and no script runs.
+    A browser reads it again after `reload` seconds, unless they are 0. HTML in the Markdown is
+    shown as text, and no script runs.
     """
     from markdown_it import MarkdownIt
 
@@ -110,6 +116,8 @@ def html_page(text: str, folder: Path, title: str) -> str:
     body = MarkdownIt("commonmark", {"html": False}).enable("table").render(text)
     # A name without slashes: a caption cannot make the page read a file of another folder.
     body = re.sub(r'src="figures/([^"/\\]+)"', inside, body)
+    # On a phone a figure keeps its size and is scrolled, by the keyboard too: its letters are read.
+    body = body.replace("<p><img", '<p class="figure" tabindex="0"><img')
     first, *others = body.split("<h2>")
     parts = [f'<section class="lead">{first}</section>']
     parts += [f'<section class="card"><h2>{one}</section>' for one in others]
@@ -118,6 +126,8 @@ def html_page(text: str, folder: Path, title: str) -> str:
         f'<meta charset="utf-8"><meta http-equiv="Content-Security-Policy" content="{_POLICY}">'
         f'<meta name="viewport" content="width=device-width"><title>{html.escape(title)}</title>'
     )
+    if reload:
+        head += f'<meta http-equiv="refresh" content="{reload}">'
     return (
         f'<!doctype html>\n<html lang="en"><head>{head}<style>{theme}{_STYLE}</style></head>\n'
         f"<body><main>{''.join(parts)}</main></body></html>\n"

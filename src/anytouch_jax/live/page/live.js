@@ -172,7 +172,7 @@ function showLive(source, about) {
     sure.replaceChildren(el("span", {}, "probability"), el("span", { className: "track" }, bar), el("span", {}, percent(one.p)));
     if (one.set === undefined) return;
     if (one.limit === null) why.textContent = `From ${one.recordings} recordings it cannot tell what is new. Record more: nine can.`;
-    else if (!one.set.length) why.textContent = "No name is likely enough.";
+    else if (!one.set.length) why.textContent = "Unsure: recordings of it were named with more certainty.";
     else if (one.set.length > 1) why.textContent = `It may be ${one.set.slice(0, 4).join(", ")}.`;
   };
   const percentile = (values, fraction) => [...values].sort((a, b) => a - b)[Math.floor(fraction * (values.length - 1))] ?? 0;

@@ -279,7 +279,8 @@ function clipCard(source, clip, images, title) {
     const one = await load(t), score = one.score ?? null;
     if (one.bitmap) showLayer(canvas, one.bitmap, one.isSurface ? one.fields : null);
     force.show(one.fields, one.isSurface ? "surface" : state.layer);
-    contact.textContent = one.error ?? (score === null ? (clip.rows.length > 1 ? "\u00a0" : "") : score > clip.threshold ? "● contact" : "○ no contact");
+    const isPressed = one.fields ? one.fields.area > 0 : score > clip.threshold; // as the layer draws it
+    contact.textContent = one.error ?? (score === null ? (clip.rows.length > 1 ? "\u00a0" : "") : isPressed ? "● contact" : "○ no contact");
   };
   return { node, words, clip, scores, measured, load, show };
 }

@@ -104,7 +104,7 @@ function showSpace(source, about) {
     draw();
   });
   const load = guard(async () => {
-    say(method === "tsne" ? "Computing the t-SNE. This takes up to a minute." : "");
+    say(method === "tsne" ? "Computing the t-SNE. This takes up to a minute." : "Reading the features.");
     points = null;
     const loaded = await json(`${source}/map?method=${method}`);
     points = loaded;

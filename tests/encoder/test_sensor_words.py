@@ -8,6 +8,7 @@ import pytest
 from measuring import gel, measuring_weights
 
 from anytouch_jax.cli.app import main
+from anytouch_jax.encoder import sensor_words
 from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.fields import measure as fields
@@ -90,3 +91,10 @@ def test_a_missing_or_damaged_folder_is_one_sentence(weights, mine):
     ):
         with pytest.raises(UserError, match=r"sensor\.json"):
             call()
+
+
+@pytest.mark.parametrize("word", ["mine.senso", "at/mine.sensors", "mine.Sensor"])
+def test_a_slip_in_the_ending_of_a_folder_is_no_new_name(word):
+    with pytest.raises(UserError, match=r"did you mean (at/)?mine\.sensor\?"):
+        sensor_words.resolve_sensor(word)
+    assert sensor_words.resolve_sensor("gel.v2").name == "gel.v2"

@@ -237,6 +237,17 @@ def test_errors_of_the_machine_and_interrupts_are_one_line_and_bugs_are_not(
         guarded("anytouch train", lambda: run(RuntimeError("a bug")))
 
 
+def test_ctrl_c_during_an_import_is_no_bug(capsys):
+    def run():
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt as stop:  # as Python 3.11 does in a class body
+            raise RuntimeError("Error calling __set_name__ on 'Field' instance") from stop
+
+    assert guarded("anytouch embed", run) == 130
+    assert capsys.readouterr().err == "interrupted\n"
+
+
 @pytest.mark.parametrize(
     "error", [AssertionError(), UserError("could not read checkpoint"), RuntimeError("x")]
 )

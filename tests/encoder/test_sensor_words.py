@@ -3,11 +3,14 @@
 import json
 from dataclasses import asdict
 
+import cv2
 import numpy as np
 import pytest
 from measuring import gel, measuring_weights
 
 from anytouch_jax.cli.app import main
+from anytouch_jax.data.manifest import manifest as manifests
+from anytouch_jax.encoder import sensor_words
 from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.errors import UserError
 from anytouch_jax.fields import measure as fields
@@ -90,3 +93,22 @@ def test_a_missing_or_damaged_folder_is_one_sentence(weights, mine):
     ):
         with pytest.raises(UserError, match=r"sensor\.json"):
             call()
+
+
+@pytest.mark.parametrize("word", ["mine.senso", "at/mine.sensors", "mine.Sensor"])
+def test_a_slip_in_the_ending_of_a_folder_is_no_new_name(word):
+    with pytest.raises(UserError, match=r"did you mean (at/)?mine\.sensor\?"):
+        sensor_words.resolve_sensor(word)
+    assert sensor_words.resolve_sensor("gel.v2").name == "gel.v2"
+
+
+def test_a_manifest_of_its_recordings_has_its_name(mine, tmp_path):
+    place = tmp_path / "all/mug"
+    place.mkdir(parents=True)
+    for number in range(3):
+        (place / f"{number}.png").write_bytes(cv2.imencode(".png", gel())[1].tobytes())
+    words = ["data", "index", "recordings", str(place.parent), "--sensor"]
+    assert main([*words, str(mine)]) == 0
+    table = manifests.read(place.parent / "recordings.parquet")
+    assert set(table.column("sensor").to_pylist()) == {"tripod"}
+    assert main([*words, str(mine.with_suffix(".senso"))]) == 2

@@ -273,16 +273,24 @@ def guarded(program: str, run: Callable[[], int]) -> int:
         advice = ". Free some space." if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
         sentence = f"{error.filename or 'a file'}: {error.strerror or error}{advice}"
     except (MemoryError, RuntimeError) as error:
+        # Python 3.11 wraps a Ctrl-C that comes while a class is made, as in an import.
+        if isinstance(error.__cause__, KeyboardInterrupt):
+            return _interrupted()
         # XLA's is a RuntimeError, and so are bugs
         if isinstance(error, RuntimeError) and "RESOURCE_EXHAUSTED" not in str(error):
             raise
         less = "Use a smaller --batch, --size, --gallery or --preset, or --model.remat in training."
         sentence = f"there is not enough memory. {less}"
     except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        return 130
+        return _interrupted()
     print(f"{program}: {shorten(sentence)}", file=sys.stderr)
     return status
+
+
+def _interrupted() -> int:
+    """Say that the command was interrupted, and return its status."""
+    print("interrupted", file=sys.stderr)
+    return 130
 
 
 def _missing_devices() -> UserError | None:

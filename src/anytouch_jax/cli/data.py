@@ -10,7 +10,7 @@ import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -184,7 +184,9 @@ class DatasetOptions:
     # Let the reader write images into ROOT, for a dataset of arrays or videos.
     export: bool = False
     sensor: str | None = None
-    """recordings, webdataset, lerobot, bags, hdf5, zarr: the sensor, by its name or a new name."""
+    """recordings, webdataset, lerobot, bags, hdf5, zarr: the sensor, by its name, a new name or a
+    folder NAME.sensor.
+    """
     split_by: str | None = None
     """recordings: what is held out: object, recording (a single image is one), a column of the
     labels, or the part of the path in the parentheses of a pattern, as '(p[0-9]+)_'. Default:
@@ -214,11 +216,14 @@ class DatasetOptions:
 def run_index(options: DatasetOptions) -> int:
     """Read the dataset, write its manifest, and print the counts with the paper's."""
     from anytouch_jax.datasets import readers
+    from anytouch_jax.encoder.sensor_words import resolve_sensor
 
     place = ("name", "root", "out", "keep")
     settings = readers.IndexOptions(
         **{name: value for name, value in vars(options).items() if name not in place}
     )
+    if options.sensor is not None:  # a manifest has the name of a fitted sensor, not its folder
+        settings = replace(settings, sensor=resolve_sensor(options.sensor).name)
     report = readers.index(
         options.name, options.root, options.out, options=settings, keep=options.keep
     )

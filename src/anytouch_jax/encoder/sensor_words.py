@@ -11,6 +11,10 @@ from typing import NamedTuple
 
 from anytouch_jax.config import OWN_SENSOR
 from anytouch_jax.doors import SENSORS, enter
+from anytouch_jax.errors import UserError
+from anytouch_jax.text import edit_distance
+
+_LETTERS = 2  # of .sensor, that are a slip
 
 
 class SensorWord(NamedTuple):
@@ -47,10 +51,15 @@ class SensorWord(NamedTuple):
 def resolve_sensor(word: str | Path) -> SensorWord:
     """Return what a word stands for.
 
-    Raises UserError for a folder NAME.sensor that is missing or damaged.
+    Raises UserError for a folder NAME.sensor that is missing or damaged, or misspelt.
     """
     path = Path(word)
     if path.suffix != OWN_SENSOR:
+        # As a name it would be one that nobody knows, measured without a width or a force.
+        if path.suffix and edit_distance(path.suffix, OWN_SENSOR) <= _LETTERS:
+            raise UserError(
+                f"sensor {str(word)!r} is not known: did you mean {path.with_suffix(OWN_SENSOR)}?"
+            )
         return SensorWord(str(word))
     numbers = enter(SENSORS["fitted"])(path.expanduser())
     return SensorWord(

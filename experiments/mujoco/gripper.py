@@ -2,7 +2,7 @@
 
 It slides up and down (`lift`), turns about the axis through its pads (`wrist`), and presses with
 two motors whose controls are newtons. The frame of a pad is that of its site: x and y as in the
-picture, z out of the gel.
+image, z out of the gel.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def gripper_scene(sensor: str, held: str, *, half: float, gravity: float = 9.81)
         gravity: m/s2 downwards.
     """
     height, width = (side / 2 * MM for side in find_sensor(sensor).field)
-    # x of a picture is x of the site: for both pads y points down.
+    # x of an image is x of the site: for both pads y points down.
     fingers = "".join(
         f"""
         <body name="{name}" pos="{side * half * MM} 0 0">

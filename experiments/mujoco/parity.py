@@ -3,7 +3,7 @@
     python -m experiments.mujoco.parity [digit ...] --poses 200
     python -m experiments.mujoco.parity --speed
 
-A record a sensor: over shapes and poses the difference of the pictures inside the contact in grey
+A record a sensor: over shapes and poses the difference of the images inside the contact in grey
 levels, the relative difference of the forces, and the indentation of MuJoCo's softened contact over
 that of the gel. A record `friction` compares directions while an object slides. Speeds are a record
 of their own.
@@ -142,7 +142,7 @@ def friction(options: Options) -> None:
 
 
 def speed(options: Options) -> None:
-    """Time a step with its picture, a batch, an untouched pad, and rays."""
+    """Time a step with its image, a batch, an untouched pad, and rays."""
     record: Record = {"kind": "speed", "machine": asdict(machine.describe())}
     for size in (112, 224):
         model, data = loaded(pressing_scene(SHAPES["ball"], "digit"))

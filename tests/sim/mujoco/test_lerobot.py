@@ -15,13 +15,13 @@ from anytouch_jax.sim.mujoco import LeRobotWriter
 
 GEL = "observation.images.tactile_left"
 RNG = np.random.default_rng(0)
-PICTURES = RNG.integers(0, 256, (5, 24, 32, 3), dtype=np.uint8)
+IMAGES = RNG.integers(0, 256, (5, 24, 32, 3), dtype=np.uint8)
 
 
 def write(root, fail=False):
     with LeRobotWriter(root, fps=20) as writer:
-        for number, picture in enumerate(PICTURES):
-            writer.add({GEL: picture, "action": [number, -1.0], "observation.state": [0.5]})
+        for number, image in enumerate(IMAGES):
+            writer.add({GEL: image, "action": [number, -1.0], "observation.state": [0.5]})
             if number == 1:
                 writer.end_episode("press")
         if fail:
@@ -39,8 +39,8 @@ def test_what_is_written_is_read(tmp_path):
     assert [row["label.action_0"] for row in rows] == [0, 1, 2, 3, 4]
     assert [row["label.task"] for row in rows] == ["press"] * 2 + ["slide"] * 3
     assert [row["timestamp"] for row in rows] == pytest.approx([0, 0.05, 0, 0.05, 0.1])
-    for number, picture in enumerate(PICTURES):
-        np.testing.assert_array_equal(decode(manifest.file(number)), picture)
+    for number, image in enumerate(IMAGES):
+        np.testing.assert_array_equal(decode(manifest.file(number)), image)
 
 
 def test_what_lerobot_asks_of_the_files(tmp_path):
@@ -52,7 +52,7 @@ def test_what_lerobot_asks_of_the_files(tmp_path):
     stats = json.loads((root / "meta/stats.json").read_text())
     assert np.shape(stats[GEL]["mean"]) == (3, 1, 1) and stats["action"]["count"] == [5]
     np.testing.assert_allclose(
-        np.ravel(stats[GEL]["mean"]), PICTURES.mean((0, 1, 2)) / 255, rtol=1e-6
+        np.ravel(stats[GEL]["mean"]), IMAGES.mean((0, 1, 2)) / 255, rtol=1e-6
     )
     np.testing.assert_allclose(stats["action"]["std"], [np.std(range(5)), 0], atol=1e-9)
     table = pyarrow.parquet.read_table(root / "data/chunk-000/file-001.parquet")

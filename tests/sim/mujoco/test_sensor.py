@@ -95,7 +95,7 @@ def test_stick_partial_slip_and_slip_follow_the_pull():
     along = math.atan2(reading.force[1], reading.force[0])
     assert abs((along - way + math.pi) % (2 * math.pi) - math.pi) < math.radians(15)
     assert reading.slip > 0.7
-    # the picture's x and y are the pad's
+    # the image's x and y are the pad's
     assert reading.force[0] < 0 < reading.force[1]
 
 
@@ -192,7 +192,6 @@ def test_the_pad_is_as_soft_as_its_gel():
 
 def test_wrong_scenes_are_told_in_a_sentence():
     xml = pressing_scene(SHAPES["ball"], "digit")
-    box = PAD.replace("0.007125 0.0095", "0.007125 0.0095")
     refused("has no site nose; it has pad", sensor_of, loaded(xml)[0], site="nose")
     round_site = xml.replace('<site name="pad" type="box"', '<site name="pad" type="sphere"')
     refused("pad has no extent: make it a box", sensor_of, loaded(round_site)[0])
@@ -200,10 +199,10 @@ def test_wrong_scenes_are_told_in_a_sentence():
         'type="box" size="0.007125 0.0095 .0005"', 'type="box" size=".001 .001 .001"'
     )
     refused(r"is 2 x 2 mm, but the gel of digit is 14\.25 x 19 mm", sensor_of, loaded(small)[0])
-    off = xml.replace(f'<site name="pad" {box}', f'<site name="pad" pos="0 0 .003" {box}')
+    off = xml.replace(f'<site name="pad" {PAD}', f'<site name="pad" pos="0 0 .003" {PAD}')
     assert off != xml
     refused("lies 3 mm in front of the surface", sensor_of, loaded(off)[0])
-    down = xml.replace(f'<site name="pad" {box}', f'<site name="pad" euler="180 0 0" {box}')
+    down = xml.replace(f'<site name="pad" {PAD}', f'<site name="pad" euler="180 0 0" {PAD}')
     refused("is not on a pad", sensor_of, loaded(down)[0])
     refused("tac3d has no camera", sensor_of, loaded(xml)[0], "tac3d")
     refused("there is no simulated sensor", sensor_of, loaded(xml)[0], "nose")
@@ -212,6 +211,12 @@ def test_wrong_scenes_are_told_in_a_sentence():
     data.qpos[2] = -3.5 * MM
     mujoco.mj_forward(model, data)
     refused("object is 3.5 mm inside the pad pad at the start", sensor_of(model).read, data)
+    # around the whole pad, MuJoCo may push it away to any side
+    large = SHAPES["ball"]._replace(geom='type="sphere" size=".03"')
+    model, data = loaded(pressing_scene(large, "digit"))
+    data.qpos[0], data.qpos[2] = 0.012, -0.008
+    mujoco.mj_forward(model, data)
+    refused("mm inside the pad pad at the start", sensor_of(model).read, data)
 
 
 def test_data_of_another_scene_are_told():
@@ -252,6 +257,23 @@ def test_a_scene_with_nan_is_not_one_without_contact():
     mujoco.mj_resetData(model, data)
     mujoco.mj_forward(model, data)
     touch.read(data)
+
+
+@pytest.mark.parametrize("word", ["poses", "sizes"])
+def test_nan_outside_of_the_state_is_not_without_contact_either(word):
+    """MuJoCo moves a mocap body to NaN, and may find no contact of a geom without a size."""
+    xml = pressing_scene(SHAPES["ball"], "digit")
+    model, data = loaded(xml.replace('<body name="finger">', '<body name="finger" mocap="true">'))
+    touch = sensor_of(model)
+    pressed(model, data, 0.5)
+    assert touch.read(data).touched
+    if word == "poses":
+        data.mocap_quat[:] = np.nan
+    else:
+        model.geom_size[:] = np.nan
+    mujoco.mj_forward(model, data)
+    assert np.isfinite(data.qpos).all()
+    refused(f"NaN in its {word}", touch.read, data)
 
 
 def test_a_flex_is_refused():

@@ -103,11 +103,18 @@ class Pads:
         sizes = (len(data.qpos), len(data.geom_xpos), len(data.site_xpos))
         if sizes != (self._model.nq, self._model.ngeom, self._model.nsite):
             raise UserError("these data are of another model than the touch sensor")
-        if not (np.isfinite(data.qpos).all() and np.isfinite(data.qvel).all()):
-            raise UserError(
-                f"the scene has NaN in its state at {data.time:g} s, so what the pads feel is "
-                "unknown: take a smaller timestep, or reset it"
-            )
+        # A mocap body has no state, and MuJoCo finds no contact of what has no place or size.
+        parts = {
+            "state": (data.qpos, data.qvel),
+            "poses": (data.geom_xpos, data.geom_xmat, data.site_xpos, data.site_xmat),
+            "sizes": (data.model.geom_size,),
+        }
+        for name, values in parts.items():
+            if not all(np.isfinite(value).all() for value in values):
+                raise UserError(
+                    f"the scene has NaN in its {name} at {data.time:g} s, so what the pads feel is "
+                    "unknown: take a smaller timestep, or reset it"
+                )
         warned = sum(int(data.warning[one].number) for one in BAD)
         before = self._warned
         self._warned = warned
@@ -138,6 +145,9 @@ class Pads:
     ) -> Met | None:
         """Return what one pad meets by its contacts."""
         pad = self.pads[number]
+        if self._is_first and self._view.load == "force":
+            # Before the force: an object around a pad is pushed anywhere, maybe not out of the gel.
+            self._check_depth(data, pad, contacts, -np.inf)
         frame = data.site_xmat[pad.site].reshape(3, 3)
         push, by_body, friction = self._pushed(data, pad, frame, contacts)
         load = -float(push[2])
@@ -146,7 +156,7 @@ class Pads:
         touching = {other for _, _, other in contacts}
         heights, below, cover = self._heights(data, pad, touching)
         top = float(heights.max())
-        if self._is_first or self._view.load == "depth":
+        if self._view.load == "depth":
             self._check_depth(data, pad, contacts, top)
         if not np.isfinite(top) or (self._view.load == "depth" and top <= 0):
             return None  # it touches beside the image

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import mujoco
 import numpy as np
@@ -38,6 +38,12 @@ class Task(NamedTuple):
     name: str
     steps: int
     shown: int  # steps of a demonstration
+    felt: Literal["force", "features"]  # what is read from a pad's image
+    memory: int  # readings before, which a policy also knows
+    rounds: int  # of demonstrations: in the first the oracle acts, then the policy itself
+    demonstrations: int  # episodes of all rounds
+    tested: int  # episodes of the test
+    at_once: int  # episodes side by side
     begin: Callable[[np.random.Generator, int], Episodes]
     state: Callable[[Episodes, int], Array]  # (n, p) what a robot knows without touch
     oracle: Callable[[Episodes, int], Array]  # (n,) the right action
@@ -215,26 +221,38 @@ def align_success(episodes: Episodes) -> Array:
 
 TASKS = {
     "hold": Task(
-        "hold",
-        HOLD_STEPS,
-        HOLD_STEPS,
-        begin_hold,
-        hold_state,
-        hold_oracle,
-        hold_act,
-        hold_cost,
-        hold_success,
+        name="hold",
+        steps=HOLD_STEPS,
+        shown=HOLD_STEPS,
+        felt="force",
+        memory=3,  # a slip shows in how the force changes
+        rounds=4,
+        demonstrations=128,
+        tested=64,
+        at_once=32,
+        begin=begin_hold,
+        state=hold_state,
+        oracle=hold_oracle,
+        act=hold_act,
+        cost=hold_cost,
+        success=hold_success,
     ),
     "align": Task(
-        "align",
-        ALIGN_STEPS,
-        3,  # the imprint does not change as the wrist turns: other keys show more
-        begin_align,
-        align_state,
-        align_oracle,
-        align_act,
-        align_cost,
-        align_success,
+        name="align",
+        steps=ALIGN_STEPS,
+        shown=3,  # the imprint does not change as the wrist turns: other keys show more
+        felt="features",
+        memory=0,
+        rounds=1,
+        demonstrations=1280,
+        tested=48,
+        at_once=24,
+        begin=begin_align,
+        state=align_state,
+        oracle=align_oracle,
+        act=align_act,
+        cost=align_cost,
+        success=align_success,
     ),
 }
 

@@ -67,8 +67,10 @@ def mujoco(folder: Path) -> Page:
     if "speed" in records:
         tables.append(_speeds(records["speed"]))
     words = "Presses in MuJoCo and by `simulate_touch` differ by this much in the contact."
-    if closed["align"]:
-        words += f" In *Align* touch closes {closed['align']['touch'].mean:.0f} % of the gap."
+    for name, parts in closed.items():
+        if parts:
+            mean = parts["touch"].mean
+            words += f" In *{name.capitalize()}* touch closes {mean:.0f} % of the gap."
     seeds = {name: len(_seeds(tasks, name, "oracle")) for name in COSTS}
     about = "; ".join(f"*{name.capitalize()}* has {count}" for name, count in seeds.items())
     return Page(

@@ -71,7 +71,7 @@ help: ## list the targets
 setup: $(STAMP) ## make .venv with the pinned versions
 
 demo: $(STAMP) ## a sensor that the encoder has never met learns to name shapes: a page within a minute, the whole below ten: [DEMO= DEMO_MINUTES=2, of each of two trainings]
-	$(PY) -m experiments.demo.run --out $(DEMO) --minutes $(DEMO_MINUTES)
+	TF_CPP_MIN_LOG_LEVEL=3 $(PY) -m experiments.demo.run --out $(DEMO) --minutes $(DEMO_MINUTES)
 
 simulate: $(STAMP) ## touch scenes by several sensors: [SCENES=]
 	$(ANYTOUCH) data simulate --out $(SCENES)

@@ -10,13 +10,9 @@ first page is there within a minute, and the whole takes less than ten on two co
 from __future__ import annotations
 
 import argparse
-import os
 import time
 from functools import partial
 from pathlib import Path
-
-# As the command does: jaxlib logs a spurious error for a program that it reads from the cache.
-os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 import numpy as np
 

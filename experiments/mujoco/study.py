@@ -45,7 +45,8 @@ class Options:
     """Two tasks in MuJoCo: blind, touch, shuffled touch and oracle."""
 
     tasks: tyro.conf.Positional[tuple[Literal["hold", "align"], ...]] = ("hold", "align")
-    seeds: int = 3
+    seeds: int = 3  # One after the other, from `first` on.
+    first: int = 0
     model: str = "anytouch-tiny"
     out: Path = RESULTS
 
@@ -230,7 +231,7 @@ def run(options: Options) -> int:
     """Run the study."""
     encoder = at.load_encoder(options.model)
     for name in options.tasks:
-        for seed in range(options.seeds):
+        for seed in range(options.first, options.first + options.seeds):
             study(TASKS[name], Eye(TASKS[name], encoder), options, seed)
     return 0
 

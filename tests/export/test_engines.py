@@ -109,7 +109,7 @@ def test_the_example_of_fields_gives_mm_and_newtons(tmp_path):
     features, out = measuring.encode_and_measure(CLIPS[:, :3], ROWS, aspect)
     scale = measuring.measure_of(first).scale
     wanted = fields_of(out, scale, shape=scale.shape)
-    np.testing.assert_allclose(space["features"], features, atol=1e-5)
+    np.testing.assert_allclose(space["features"], features, atol=3e-5)
     np.testing.assert_allclose(space["depth"], wanted.depth, atol=1e-4)
     np.testing.assert_allclose(space["force"], wanted.force, atol=1e-3)
     # every formula, in the words of the file

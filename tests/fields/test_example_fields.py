@@ -13,22 +13,22 @@ from anytouch_jax.encoder.encoder import example_touches, load_encoder
 # the shear everywhere.
 LENGTHS = """
 touch                     depth mean_depth      along       down     spread       area
-dots-digit               0.5089     0.1598   -0.00367    0.00688    0.04209      104.2
-dots-gelsight_mini        1.086     0.5877    0.00517    0.00544    0.06947      141.7
-dots-gelslim             0.2828    0.07358   -0.00149   -0.00087    0.01331      57.86
-ring-digit               0.7526     0.4946    0.00749    0.00786    0.06181      91.95
-ring-gelsight_mini        1.076     0.6783    0.00603   -0.00545    0.07439      88.91
-ring-gelslim             0.4324     0.2193   -0.00181   -0.00871    0.02961      73.52
+dots-digit               0.4957     0.1639    0.00204    0.00241    0.04089      111.7
+dots-gelsight_mini         1.13     0.6172    0.00881    0.00155    0.06957      139.4
+dots-gelslim             0.2997    0.07828   -0.00189   -0.00182    0.01332      62.54
+ring-digit               0.8859     0.5453    0.00727    0.01697    0.06472      91.35
+ring-gelsight_mini         1.19     0.7331    0.00063   -0.00229    0.07639      89.17
+ring-gelslim             0.4431     0.2262   -0.00095   -0.00323    0.02863      76.29
 """
 # mm, N and N mm.
 FORCES = """
 touch                  centre_x   centre_y    force_x    force_y    force_z     torque
-dots-digit             -0.09372    -0.9144   -0.00449    0.00897      2.099    0.03425
-dots-gelsight_mini      -0.2454     0.3549   -0.00965    0.02421      5.925   -0.01395
-dots-gelslim              1.439     -2.664    0.00821   -0.00819      1.116   -0.01122
-ring-digit              -0.2987     -2.229    0.00109   -0.00707      4.478    0.03121
-ring-gelsight_mini     -0.05057     -1.451    0.00312   -0.00048      5.497    0.01245
-ring-gelslim            0.04805     -1.642   -0.00013   -0.01754      3.494    0.01715
+dots-digit             -0.07352     -0.968   -0.00176    0.00478      2.197    0.04523
+dots-gelsight_mini      -0.2977      0.232   -0.00508    0.01839       6.13   -0.01951
+dots-gelslim              1.322     -2.831    0.01483   -0.00931      1.202   -0.00176
+ring-digit              -0.2424     -2.374    0.00436   -0.01583      4.751    0.04572
+ring-gelsight_mini     -0.05747     -1.493   -0.00117   -0.00201      5.808    0.01058
+ring-gelslim            0.07856     -1.626    0.00191   -0.02036      3.492    0.00191
 """
 RELATIVE, ABSOLUTE = 0.02, 0.0015
 

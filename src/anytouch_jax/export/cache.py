@@ -36,7 +36,7 @@ def cached_export(
     """Return the export of touches on the encoder's engine, None where XLA computes.
 
     "auto" is onnxruntime if it is installed and jax runs on a CPU. The encoder must compute in
-    float32, have at most LARGEST parameters, and differ from its export by at most 1e-5. XLA
+    float32, have at most LARGEST parameters, and differ from its export by at most 3e-5. XLA
     computes clips of more than one segment.
 
     Args:

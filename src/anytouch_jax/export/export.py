@@ -39,7 +39,8 @@ if TYPE_CHECKING:
     from anytouch_jax.encoder.base import Encoder
 
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
-ONNX_TOLERANCE = 1e-5
+# XLA and onnxruntime add in another order: 1.7e-5 was seen on a CPU with AMX.
+ONNX_TOLERANCE = 3e-5
 # Differences from the live model, over the largest feature: the platform's own rounding.
 TOLERANCE = {"float32": 1e-4, "bfloat16": 5e-2, "float64": 1e-4}
 _CHECKED = (1, 5)  # batch sizes

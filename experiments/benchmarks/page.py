@@ -43,10 +43,10 @@ PATIENCE = 600.0  # seconds to wait for a head or for frames
 
 
 @contextmanager
-def serving(live: Live) -> Iterator[str]:
-    """Serve the page of `live` by a thread, and give its address."""
+def serving(sources: list[Any]) -> Iterator[str]:
+    """Serve the page of `sources` by a thread, and give its address."""
     running = uvicorn.Server(
-        uvicorn.Config(server.app([live]), port=0, log_level="critical", lifespan="off")
+        uvicorn.Config(server.app(sources), port=0, log_level="critical", lifespan="off")
     )
     thread = threading.Thread(target=running.run, daemon=True)
     thread.start()
@@ -55,6 +55,15 @@ def serving(live: Live) -> Iterator[str]:
     yield f"http://127.0.0.1:{running.servers[0].sockets[0].getsockname()[1]}/"
     running.should_exit = running.force_exit = True
     thread.join(10)
+
+
+def wait_for_background(live: Live) -> None:
+    """Wait until the untouched gel is known. Before, the first frame waits for the compiler."""
+    end = time.monotonic() + PATIENCE
+    while live.frames.setup.gel is None:
+        if time.monotonic() > end:
+            raise UserError(f"The untouched gel was not found within {PATIENCE:g} s.")
+        time.sleep(0.1)
 
 
 def teach(live: Live) -> None:
@@ -107,8 +116,8 @@ def measure(model: str, layers: Sequence[str]) -> list[dict[str, Any]]:
         live.start()
         browser = driver.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
         try:
-            with serving(live) as address:
-                time.sleep(3)  # until the untouched gel is known
+            with serving([live]) as address:
+                wait_for_background(live)
                 live.frames.capture_background()
                 teach(live)
                 page = browser.new_page(viewport=VIEW)

@@ -11,7 +11,7 @@ from anytouch_jax.errors import UserError
 
 @pytest.mark.parametrize("bad", [{"val": -0.1}, {"val": 0.6, "test": 0.5}, {"test": 2}])
 def test_fractions_are_checked(bad):
-    with pytest.raises(UserError, match="are shares"):
+    with pytest.raises(UserError, match="are fractions"):
         IndexOptions(**bad)
 
 

@@ -105,8 +105,8 @@ def test_by_default_few_recordings_give_enough_to_test_on():
     # a fraction that is given stays, and the other one leaves it room
     given = list(ranked_split(map(str, range(24)), IndexOptions(test=0.05)).values())
     assert (given.count("val"), given.count("test")) == (2, 1)
-    assert IndexOptions(test=1.0).shares(24) == (0.0, 1.0)
-    assert IndexOptions(val=0.95).shares(24) == pytest.approx((0.95, 0.05))
+    assert IndexOptions(test=1.0).fractions(24) == (0.0, 1.0)
+    assert IndexOptions(val=0.95).fractions(24) == pytest.approx((0.95, 0.05))
 
 
 @pytest.mark.parametrize(

@@ -11,14 +11,11 @@ import shutil
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-import uvicorn
 from view_world import SCRIPT, PressCamera
 
 from anytouch_jax.data.manifest import manifest as manifests
@@ -26,6 +23,7 @@ from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.live.page import live as live_module
 from anytouch_jax.live.page import server
 from anytouch_jax.live.page.live import Live
+from experiments.benchmarks.page import serving
 
 CHROMIUM = shutil.which("chromium")
 AXE = Path(sys.prefix) / "node_modules" / "axe-core" / "axe.min.js"
@@ -36,21 +34,6 @@ FRAMES = "Number(document.getElementById('main').dataset.frames)"
 pytestmark = pytest.mark.skipif(
     CHROMIUM is None, reason="there is no Chromium: apt-get install chromium"
 )
-
-
-@contextmanager
-def serving(sources: list) -> Iterator[str]:
-    """Serve the page of `sources` by a thread, and give its address."""
-    running = uvicorn.Server(
-        uvicorn.Config(server.app(sources), port=0, log_level="error", lifespan="off")
-    )
-    thread = threading.Thread(target=running.run, daemon=True)
-    thread.start()
-    while not running.started:
-        time.sleep(0.01)
-    yield f"http://127.0.0.1:{running.servers[0].sockets[0].getsockname()[1]}/"
-    running.should_exit = running.force_exit = True
-    thread.join(10)
 
 
 def test_chromium_shows_the_page(touches, features, tmp_path):

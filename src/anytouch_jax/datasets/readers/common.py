@@ -114,10 +114,10 @@ class IndexOptions:
         test = self.test or 0
         if not (0 <= val <= 1 and 0 <= test <= 1 and val + test <= 1):
             raise UserError(
-                f"val {val} and test {test} are shares: both at least 0, together at most 1"
+                f"val {val} and test {test} are fractions: both at least 0, together at most 1"
             )
 
-    def shares(self, groups: int | None = None) -> tuple[float, float]:
+    def fractions(self, groups: int | None = None) -> tuple[float, float]:
         """Return the fractions of val and test.
 
         By default both are 5 %. Of so few objects or recordings that this says nothing, more are
@@ -126,13 +126,13 @@ class IndexOptions:
         val = self.val
         test = self.test
         if test is None:
-            test = min(_share(groups, *_TEST), 1 - (val or 0))
+            test = min(_fraction(groups, *_TEST), 1 - (val or 0))
         if val is None:
-            val = min(_share(groups, *_VAL), 1 - test)
+            val = min(_fraction(groups, *_VAL), 1 - test)
         return val, test
 
 
-def _share(groups: int | None, count: int, most: float) -> float:
+def _fraction(groups: int | None, count: int, most: float) -> float:
     """Return the fraction that `count` of `groups` are, of HELD_OUT to `most`."""
     if not groups:
         return HELD_OUT
@@ -508,7 +508,7 @@ def hash_split(dataset: str, group: str, options: IndexOptions) -> str:
 
     Other groups move none.
     """
-    val, test = options.shares()
+    val, test = options.fractions()
     digest = hashlib.sha256(f"{dataset}/{group}".encode()).digest()
     fraction = int.from_bytes(digest[:8], "big") / 2**64
     if fraction < val:

@@ -614,9 +614,9 @@ def _splits(
     for pool in pools.values():
         index.drawn |= ranked_split(pool, index.options, total)
     splits |= index.drawn
-    shares = dict(zip(("val", "test"), index.options.shares(), strict=True))
-    for split in shares if pools else ():
-        if split not in splits.values() and shares[split]:
+    fractions = dict(zip(("val", "test"), index.options.fractions(), strict=True))
+    for split in fractions if pools else ():
+        if split not in splits.values() and fractions[split]:
             index.notes.append(f"there are too few recordings for split {split}")
     if any(stated.values()):
         index.notes.append("the splits are those that the lists in mask/ state")

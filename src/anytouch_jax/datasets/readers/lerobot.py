@@ -163,7 +163,7 @@ def _stated_splits(
     stated: dict[int, str] = {}
     splits = dict(info.get("splits") or {})
     if len(splits) < 2:
-        if splits and sum(index.options.shares()):
+        if splits and sum(index.options.fractions()):
             index.notes.append(
                 f"meta/info.json states split {next(iter(splits))} alone, so episodes are split by "
                 "hash; --val 0 --test 0 keeps all in train"

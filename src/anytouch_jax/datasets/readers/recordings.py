@@ -234,16 +234,16 @@ def ranked_split(
     """Return the split of every group, by rank: sorted by SHA-256, the first are val, the last
     test, the others train.
 
-    The counts are the rounded shares. A share above 0 gets at least one group, if there are enough.
-    Another group moves at most one at each cut, if the shares are given. Those by default depend on
-    the number of groups, `total` if these are a part of them.
+    The counts are the rounded fractions. One above 0 gets at least one group, if there are enough.
+    Another group moves at most one at each cut, if the fractions are given. By default they depend
+    on the number of groups, which is `total` if these are a part of them.
     """
     order = sorted(set(groups), key=lambda group: hashlib.sha256(group.encode()).digest())
-    val_share, test_share = options.shares(total or len(order))
-    most = max(0, len(order) - (val_share + test_share < 1))
-    test = min(most, max(round(test_share * len(order)), test_share > 0))
-    val = min(most - test, max(round(val_share * len(order)), val_share > 0))
-    if val_share and not val and test > 1:
+    val_part, test_part = options.fractions(total or len(order))
+    most = max(0, len(order) - (val_part + test_part < 1))
+    test = min(most, max(round(test_part * len(order)), test_part > 0))
+    val = min(most - test, max(round(val_part * len(order)), val_part > 0))
+    if val_part and not val and test > 1:
         test = test - 1
         val = 1
     parts = ["val"] * val + ["train"] * (len(order) - val - test) + ["test"] * test
@@ -281,13 +281,13 @@ def _assign_splits(
     table["split"] = [
         split or ranked[groups[part]] for part, split in zip(parts, given, strict=True)
     ]
-    shares = dict(zip(("val", "test"), options.shares(), strict=True))
-    if by == "object" and len(objects) > 1 and sum(shares.values()) > 0:
+    fractions = dict(zip(("val", "test"), options.fractions(), strict=True))
+    if by == "object" and len(objects) > 1 and sum(fractions.values()) > 0:
         index.notes.append(
             "whole objects are held out; for a classifier of objects: --split-by recording"
         )
     for split in ("val", "test"):
-        if split not in table["split"] and shares[split]:
+        if split not in table["split"] and fractions[split]:
             reason = "there are too few objects or recordings for" if objects else "no folder is of"
             index.notes.append(f"{reason} split {split}")
 

@@ -64,8 +64,8 @@ def make_setup(
 ) -> Setup:
     """Return a setup with a background.
 
-    A background that does not fit a calibrated sensor is logged, and is the setup's note. Of
-    another gel deviations are wider, and of another device nothing is measured.
+    A background that does not fit a calibrated sensor is logged, and is the setup's note. If it is
+    of another gel, deviations are wider. If it is of another device, nothing is measured.
 
     Args:
         encoder: what frames are prepared for.

@@ -26,7 +26,7 @@ from anytouch_jax.config import UNIVERSAL
 from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.encoder.measured import Fields
 from anytouch_jax.fields.calibration import AMONG_OBJECTS
-from anytouch_jax.fields.measure import GELS, interval_of
+from anytouch_jax.fields.measure import GELS, border_in_contact, interval_of
 from anytouch_jax.sim.recorder import simulate_touch
 from anytouch_jax.sim.sensing.sensors import SENSORS, draw_unit
 from anytouch_jax.train.mesh import enable_compilation_cache
@@ -141,7 +141,13 @@ def calibrated(one: Presses) -> Iterator[tuple[Array, Array]]:
             continue
         factor = float(np.exp(np.median(np.log(one.force[own] / read[own]))))
         assert one.family.force_low is not None and one.family.force_high is not None
-        low, high = interval_of(factor * read, _deviation(one.family), "calibrated", AMONG_OBJECTS)
+        low, high = interval_of(
+            factor * read,
+            _deviation(one.family),
+            "calibrated",
+            AMONG_OBJECTS,
+            border_in_contact(one.family.contact),
+        )
         yield (
             inside(low, high, one.force)[rest],
             np.abs(factor * read / one.force - 1)[rest],

@@ -29,7 +29,7 @@ from anytouch_jax.batch import FieldBatch
 from anytouch_jax.config import Config, SimulatedConfig, parse_json
 from anytouch_jax.data.background.dots import DotFlow
 from anytouch_jax.fields.loss import LEAST_FORCE, TOUCHED, output_terms
-from anytouch_jax.fields.measure import Measure, Scale
+from anytouch_jax.fields.measure import Measure, Scale, border_in_contact, interval_of
 from anytouch_jax.fields.outputs import FORCE, LENGTH, STATES, TORQUE, FieldOutput
 from anytouch_jax.nn.functional import build
 from anytouch_jax.objectives import normalise_touch
@@ -63,6 +63,7 @@ SETTINGS: dict[str, Any] = {
     "run.keep": 1,
     "run.figure_every": 0,
 }
+STIFFNESS = 0.15  # deviation of the logarithm of the modulus among gels of a family
 QUANTITIES = ("depth", "shear", "normal", "tangential", "torque", "slip")
 
 
@@ -341,6 +342,8 @@ def scores(
         found = touch_errors(
             fields, batch, touch.width[:, -1], touch.modulus[:, -1], factors["depth"]
         )
+        stiffness = np.exp(STIFFNESS * np.random.default_rng(number).standard_normal(size))
+        found["covered"] = covered_forces(fields, batch, stiffness, factors["normal"])
         out, _, free = read(1000 + number, 1, 1)
         newton = np.abs(out.force[:, 2]) * free.modulus[:, -1] * free.width[:, -1] ** 2 * 1e-3
         found |= {"false_contact": (out.contact > 0).any((1, 2)), "false_force": newton > 0.05}
@@ -352,6 +355,25 @@ def scores(
         for name, v in joined.items()
         if len(v)
     }
+
+
+def covered_forces(
+    out: FieldOutput, batch: FieldBatch, stiffness: np.ndarray, factor: float
+) -> np.ndarray:
+    """Return which true forces lie in the 90 % interval of a device of a known family.
+
+    Args:
+        out: what was read of touches.
+        batch: the touches.
+        stiffness: of each gel, over that of its family (B,).
+        factor: on the deviations of normal forces.
+    """
+    deviation = factor * np.sqrt(2) * np.exp(5 * np.tanh(out.force_log[:, 1] / 5))
+    at_border = border_in_contact(1 / (1 + np.exp(-out.contact)))
+    low, high = interval_of(out.force[:, 2], deviation, "family", 0.0, at_border)
+    true = batch.force[:, 2] * stiffness
+    enough = (batch.pressure > TOUCHED).sum((1, 2)) >= 8
+    return ((low <= true) & (true <= high))[enough]
 
 
 def dots_errors(out: FieldOutput, batch: FieldBatch, touch: Any) -> dict[str, np.ndarray]:

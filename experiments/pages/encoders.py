@@ -118,7 +118,7 @@ def measure(folder: Path) -> Page:
         for name, one in sensors.items()
     }
     rows = [
-        (name, one["depth"], *map(fractions[name].get, ("iou", "force", "inside")))
+        (name, one["depth"], *map(fractions[name].get, ("iou", "force", "inside", "covered")))
         for name, one in sensors.items()
     ]
     others = ("dots_shear", "drag", "shear", "false_contact", "false_force")

@@ -128,7 +128,8 @@ def test_without_contact_and_without_a_width_nothing_is_invented():
 
 
 def test_the_interval_of_force_is_of_factors_and_as_wide_as_what_is_known():
-    sure = output(force_log=np.full((1, 2), -50.0))
+    within = np.pad(np.full((1, 10, 10), 30.0), [(0, 0), *2 * [(5, SIDE - 15)]])
+    sure = output(force_log=np.full((1, 2), -50.0), contact=within - 15)
     scales = [
         fields.scale_of({}, "digit"),
         fields.scale_of({}, "mine", 14.25),
@@ -148,9 +149,15 @@ def test_the_interval_of_force_is_of_factors_and_as_wide_as_what_is_known():
     assert unknown[0] > 1.2 * unknown[1]
     np.testing.assert_allclose(calibrated, fields.Z * 0.2, rtol=0.15)
     # The network's own deviation comes on top, and a fault says that nothing is known.
-    wide = fields.fields_of(output(), scales[0], shape=4 / 3)
+    wide = fields.fields_of(output(contact=sure.contact), scales[0], shape=4 / 3)
     faulty = fields.fields_of(sure, scales[0], shape=4 / 3, faults=("grey",))
     assert wide.force_high > one.force_high and faulty.force_low == 0
+    # How deep the gel is at the border cannot be seen, so the force may be larger, not smaller.
+    everywhere = output(force_log=sure.force_log, contact=np.full_like(sure.contact, 5.0))
+    leaving, inside = (
+        fields.fields_of(read, scales[0], shape=4 / 3) for read in (everywhere, sure)
+    )
+    assert leaving.force_high > 2 * inside.force_high and leaving.force_low == inside.force_low
     assert fields.fields_of(sure, fields.scale_of({}, "mine"), shape=1.0).force_low is None
 
 

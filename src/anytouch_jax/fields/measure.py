@@ -27,6 +27,7 @@ from anytouch_jax.fields.images import depth_levels as depth_levels
 from anytouch_jax.fields.images import overlay as overlay
 from anytouch_jax.fields.images import write_surface as write_surface
 from anytouch_jax.fields.outputs import FORCE, LENGTH, TORQUE
+from anytouch_jax.fields.poisson import border
 from anytouch_jax.fields.ruler import Ruler, another_encoder, read_ruler, ruler_of_today
 from anytouch_jax.sensors import RECORDS
 
@@ -54,6 +55,9 @@ INTERVALS = {
     "family": (0.35, 0.35),
     "unknown": (0.9, 1.7),
 }
+# What it reaches further up for a contact that covers the whole border of the image: how deep the
+# gel is there cannot be seen, and cloth over a whole gel is read at half of its depth.
+BEYOND_BORDER = 1.2
 Z = 1.645  # standard deviations from the mean to 5 and 95 %
 # The deviation of a normal force is a factor. Below this force, over modulus times width squared,
 # it stays that of this force, or a force of nothing would be known exactly.
@@ -267,7 +271,11 @@ def _forces(out: FieldOutput, scale: Scale, mm: float) -> dict[str, Array]:
     sideways = np.repeat(factors["tangential"] * FORCE * deviation[:, :1], 2, axis=1)
     normal = factors["normal"] * (out.force[:, 2:] + LEAST_FORCE) * deviation[:, 1:]
     low, high = interval_of(
-        out.force[:, 2], factors["normal"] * deviation[:, 1], scale.case, scale.spread
+        out.force[:, 2],
+        factors["normal"] * deviation[:, 1],
+        scale.case,
+        scale.spread,
+        border_in_contact(_logistic(out.contact)),
     )
     values = {
         "force": newton * out.force,
@@ -283,7 +291,17 @@ def _forces(out: FieldOutput, scale: Scale, mm: float) -> dict[str, Array]:
     return values
 
 
-def interval_of(force: Array, deviation: Array, case: str, spread: float) -> tuple[Array, Array]:
+def border_in_contact(contact: Array) -> Array:
+    """Return which fraction of the image's border (B,) is in contact, of its probability
+    (B, h, w).
+    """
+    ring = border(*contact.shape[1:]) > 0
+    return np.asarray((contact[:, ring] > 0.5).mean(1))
+
+
+def interval_of(
+    force: Array, deviation: Array, case: str, spread: float, at_border: Array
+) -> tuple[Array, Array]:
     """Return the ends of the 90 % intervals of normal forces (B,).
 
     Errors are factors. That of the network and what is not known of the device are independent.
@@ -293,8 +311,10 @@ def interval_of(force: Array, deviation: Array, case: str, spread: float) -> tup
         deviation: of their logarithms, by the network.
         case: what is known of the device, see INTERVALS, or "calibrated".
         spread: of a calibrated one, the deviation of the logarithm of its factor.
+        at_border: the fraction of the border that is in contact (B,).
     """
     down, up = INTERVALS.get(case, (Z * spread, Z * spread))
+    up = up + BEYOND_BORDER * at_border
     own = Z * deviation
     least = force + LEAST_FORCE
     low = least * np.exp(-np.hypot(own, down)) - LEAST_FORCE

@@ -314,11 +314,11 @@ def interval_of(
         at_border: the fraction of the border that is in contact (B,).
     """
     down, up = INTERVALS.get(case, (Z * spread, Z * spread))
-    up = up + BEYOND_BORDER * at_border
+    further = up + BEYOND_BORDER * at_border
     own = Z * deviation
     least = force + LEAST_FORCE
     low = least * np.exp(-np.hypot(own, down)) - LEAST_FORCE
-    high = least * np.exp(np.hypot(own, up)) - LEAST_FORCE
+    high = least * np.exp(np.hypot(own, further)) - LEAST_FORCE
     return np.maximum(low, 0), high
 
 

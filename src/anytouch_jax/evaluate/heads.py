@@ -407,7 +407,7 @@ def _gradient_step(
     return tuple(jax.enable_x64(False)(function) for function in (tx.init, jax.jit(step)))
 
 
-def calibrate(  # noqa: PLR0913 - a linear head's calibration reads all that a probe knows of rows
+def calibrate_head(  # noqa: PLR0913 - a linear head's calibration reads all that a probe knows of rows
     head: LinearHead,
     features: Array,
     y: Array,

@@ -100,7 +100,7 @@ def task_of(table: Manifest, options: LabelProbeOptions) -> Task:
     return task
 
 
-def select_rows(table: Manifest, task: Task, options: LabelProbeOptions) -> TaskRows:
+def labelled_rows(table: Manifest, task: Task, options: LabelProbeOptions) -> TaskRows:
     """Return the rows with a label. Raises UserError if there are none, or none of a sensor."""
     rows = tasks.select(table, task, options.frames)
     known = np.unique(rows.sensors)

@@ -89,7 +89,7 @@ def calibrated(
     numbers = np.unique(rows.labels, return_inverse=True)[1]
     try:
         folds = splits.group_folds(fit, rows.groups, numbers, splits.FOLDS)
-        head = heads.calibrate(
+        head = heads.calibrate_head(
             head, x, rows.labels, rows.groups, rows.sensors, fit, val, folds, penalty, **limits
         )
     except UserError as error:

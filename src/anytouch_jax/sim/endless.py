@@ -44,8 +44,8 @@ from anytouch_jax.sim.scene import (
     draw_by_hand,
     draw_gesture,
     draw_place,
-    moved,
     objects_and_splits,
+    trajectory_at,
 )
 from anytouch_jax.sim.sensing.optics import Photometry
 from anytouch_jax.sim.sensing.own import find_sensor
@@ -384,7 +384,7 @@ def _draw_take(
     hand = draw_by_hand(sampling.depth, rng, shared.gesture, shared.yaw)
     straight = (shared.gesture, shared.yaw, jnp.zeros(2), jnp.zeros(2))
     own, turn, offset, tilt = jax.tree.map(partial(jnp.where, shared.by_hand), hand, straight)
-    motion, depth = moved(own, _times(own, sampling.frames, rng), 0.04, jnp)
+    motion, depth = trajectory_at(own, _times(own, sampling.frames, rng), 0.04, jnp)
     # A clip that would show no contact shows the deepest press instead.
     depth = jnp.where(jnp.max(depth) < LEAST_DEPTH, own.depth, depth)
     depth = jnp.where(rng.uniform() < sampling.free, -1.0, depth)

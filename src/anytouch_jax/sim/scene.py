@@ -280,10 +280,10 @@ def trajectory(frames: int, gesture: Gesture) -> tuple[Leaf, Leaf]:
     times = gesture.middle + gesture.shown * np.linspace(-0.5, 0.5, frames)
     # A lift shorter than a frame would not be seen.
     gap = max(0.04, gesture.shown / (frames - 1) / 2)
-    return moved(gesture, times, gap, np)
+    return trajectory_at(gesture, times, gap, np)
 
 
-def moved(gesture: Gesture, times: Leaf, gap: Scalar, xp: ModuleType) -> tuple[Leaf, Leaf]:
+def trajectory_at(gesture: Gesture, times: Leaf, gap: Scalar, xp: ModuleType) -> tuple[Leaf, Leaf]:
     """Return motion (T, 3) and depth (T,) as `trajectory` at `times` (T,).
 
     A lift lasts `gap` to both sides.

@@ -92,7 +92,7 @@ def open_batches(
     )
 
 
-def choose_tokenizer(
+def tokenizer_of_run(
     config: Config, data: RunData, clip: PathLike | None, stored: Path | None
 ) -> Tokenizer | None:
     """Return the tokenizer of stage 2, or None.

@@ -38,7 +38,7 @@ from anytouch_jax.weights.tree import flatten
 Params = dict[str, Any]
 
 
-class Start(NamedTuple):
+class InitialParams(NamedTuple):
     """The first parameters of a run, sentences to log, and the sensors that they were trained
     on.
     """
@@ -50,7 +50,7 @@ class Start(NamedTuple):
 
 def load_init(
     fresh: Params, config: Config, *, init: str | Path | None = None, clip: str | Path | None = None
-) -> Start:
+) -> InitialParams:
     """Return the first parameters of a run: `fresh` with parts of `init` and `clip` (golden
     K_weight_loading_map).
 
@@ -92,7 +92,9 @@ def load_init(
                 notes.append(
                     f"{file} has no projection: that of the touch encoder starts untrained"
                 )
-    return Start(first_params(fresh, config.model, stage1=stage1, clip=towers), notes, trained)
+    return InitialParams(
+        first_params(fresh, config.model, stage1=stage1, clip=towers), notes, trained
+    )
 
 
 def _check_init(loaded: Loaded, config: Config) -> None:
@@ -231,7 +233,7 @@ def _replace(params: Params, parts: Params) -> Params:
 
 def load_start(
     fresh: Params, config: Config, *, init: str | Path | None = None, clip: str | Path | None = None
-) -> Start:
+) -> InitialParams:
     """Return the first parameters of a run, as `load_init`, where `init` may also be an encoder of
     RGB images.
 
@@ -240,7 +242,9 @@ def load_start(
     """
     model, weights = (None, None) if init is None else open_family(registry.locate(init))
     if model is not None:
-        start = Start(fresh, [], ()) if clip is None else load_init(fresh, config, clip=clip)
+        start = (
+            InitialParams(fresh, [], ()) if clip is None else load_init(fresh, config, clip=clip)
+        )
         adopt = enter(WEIGHTS["image encoder"])
         touch, notes = adopt(model, str(init), config, start.params["touch"])
         return start._replace(params={**start.params, "touch": touch}, notes=[*start.notes, *notes])

@@ -113,7 +113,14 @@ def labelled_rows(table: Manifest, task: Task, options: LabelProbeOptions) -> Ta
 
 
 def plan_rows(table: Manifest, task: Task, rows: TaskRows, options: LabelProbeOptions) -> LabelPlan:
-    """Decide what is fitted on and tested. Raises UserError if nothing can be."""
+    """Decide what is fitted on and tested. Raises UserError if nothing can be.
+
+    Args:
+        table: the frames.
+        task: with the label and the group.
+        rows: that have the label.
+        options: of the probe.
+    """
     if options.train_sensor is not None and options.test_sensor is not None:
         return _between_sensors(task, rows, options, options.train_sensor, options.test_sensor)
     subsets = _subsets(table, task, rows, options.leave_out)

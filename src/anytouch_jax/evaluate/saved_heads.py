@@ -29,6 +29,15 @@ def save_probed(
     """Write the linear head that a result was scored with, calibrated on rows it has not seen.
 
     Where groups were left out in turn it is fitted on all rows.
+
+    Args:
+        source: what the features are of.
+        x: f32 (n, d).
+        rows: that have the label.
+        result: of the probe, with the selected penalty.
+        options: of the probe; `save` is the file.
+        backgrounds: the untouched gels, which go into the file.
+        log: takes a sentence on the head.
     """
     path = options.save
     encoder = source.encoder

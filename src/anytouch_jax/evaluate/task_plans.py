@@ -40,6 +40,13 @@ def plan_tasks(
     """Return the plans of the tasks that can be probed, and why the others cannot.
 
     Raises UserError if none can.
+
+    Args:
+        table: the frames.
+        names: of tasks, or tasks.
+        options: of the probe.
+        among: chooses some of a task's rows.
+        log: takes a sentence on what is left out.
     """
     plans = list[TaskPlan]()
     left_out = dict[str, str]()

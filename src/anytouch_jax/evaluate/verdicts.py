@@ -103,7 +103,14 @@ def _untrained(own: ScoredHead, untrained: ScoredHead, task: str, regression: bo
 def sentences(
     own: ScoredHead, controls: Sequence[ScoredHead], task: str = "", regression: bool = False
 ) -> list[str]:
-    """Return what is to say of a head on features of a user, beside the controls of a probe."""
+    """Return what is to say of a head on features of a user, beside the controls of a probe.
+
+    Args:
+        own: the head on the user's features.
+        controls: on raw pixels, a random encoder and so on.
+        task: what was probed, if there are several tasks.
+        regression: whether scores are R2, not accuracies.
+    """
     if not controls:
         return []
     # the control over which the features gain least

@@ -241,7 +241,11 @@ def make_world(
 ) -> World:
     """Return the world of these objects and sensors, as numpy arrays.
 
-    `places` of each object can be photographed.
+    Args:
+        things: the objects.
+        sensors: names of the table, or folders of fitted ones.
+        places: of each object that can be photographed.
+        seed: of the places.
     """
     reliefs = over_cores(
         partial(shapes.relief, pixels=RELIEF, pitch=SPACING), [thing.shape for thing in things]
@@ -273,10 +277,16 @@ def over_cores(work: Callable[[_Item], _Result], items: Sequence[_Item]) -> list
 def sample_touches(
     key: Array, world: World, sampling: Sampling, count: int, gallery: Array | None = None
 ) -> SimulatedTouches:
-    """Return `count` touches drawn from `key`. `sampling` and `count` are static under jit.
+    """Return `count` touches drawn from `key`.
 
-    The second take is by the family `gallery`, if given. A key gives the same touches on one
-    machine.
+    A key gives the same touches on one machine.
+
+    Args:
+        key: of the draws.
+        world: objects and sensors.
+        sampling: how touches are drawn; static under jit.
+        count: of touches; static under jit.
+        gallery: number of the family that takes the second take, if given.
     """
     return simulate_drawn(draw_touches(key, world, sampling, count, gallery), sampling)
 

@@ -54,9 +54,13 @@ def load_init(
     """Return the first parameters of a run: `fresh` with parts of `init` and `clip` (golden
     K_weight_loading_map).
 
-    `init`, a run or a weights file, gives the touch encoder and the decoder. `clip`, CLIP weights,
-    gives the towers and, without `init`, the touch encoder. Raises UserError if either does not fit
-    the run.
+    Raises UserError if `init` or `clip` does not fit the run.
+
+    Args:
+        fresh: parameters of the network before training.
+        config: of the run.
+        init: a run or a weights file, which gives the touch encoder and the decoder.
+        clip: CLIP weights, which give the towers and, without `init`, the touch encoder.
     """
     notes: list[str] = []
     trained: tuple[str, ...] = ()
@@ -186,6 +190,12 @@ def first_params(
     Without `stage1` the touch encoder starts from CLIP's vision tower. The patch kernel is repeated
     over the frames and not divided, as the authors do (golden Q1): the response to a still is three
     times CLIP's. A tower without a projection leaves that of `params`. Raises WeightsError.
+
+    Args:
+        params: fresh ones.
+        model: the network.
+        stage1: parameters of a stage-1 run, for touch encoder and decoder.
+        clip: arrays of CLIP by name, for the towers and the temperature.
     """
     merged = dict(params)
     if clip is not None and stage1 is None:

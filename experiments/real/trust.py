@@ -134,7 +134,7 @@ def fitted(data: Touches, fit: Array, val: Array, options: TrustOptions) -> Line
     (model,) = heads.linear_path(data.x[rows], numbers[rows], (options.penalty,))
     head = heads.linear_head(model, names, label="", pooling="class", frames=1, fingerprint="")
     folds = splits.group_folds(rows, data.groups, numbers, splits.FOLDS)
-    return heads.calibrate(
+    return heads.calibrate_head(
         head,
         data.x,
         data.y,

@@ -377,6 +377,12 @@ def align_embeddings(params: Params, batch: AlignBatch, touch: Array, *, net: Ne
 
     A tower runs over its V or L slots only, and not at all without slots. Pixels are normalised
     floats.
+
+    Args:
+        params: Of the network.
+        batch: With its packed images (V, H, W, 3) and texts (L, tokens).
+        touch: Unit-norm embeddings (B, E).
+        net: The network.
     """
     batch = _arrays(batch)
     (touch,) = _arrays((touch,))

@@ -40,7 +40,7 @@ def calibrated(x, y, groups, sensors, fraction=0.8, **options):
         model, names, label="shape", pooling="class", frames=1, fingerprint="f"
     )
     folds = splits.group_folds(fit, groups, numbers, 4)
-    return heads.calibrate(head, x, y, groups, sensors, fit, val, folds, 0.01, **options)
+    return heads.calibrate_head(head, x, y, groups, sensors, fit, val, folds, 0.01, **options)
 
 
 @pytest.mark.parametrize(("alike", "count", "above"), [(1.0, 30, 1 / 31), (0.0, 12, 0.0)])

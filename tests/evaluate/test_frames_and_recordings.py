@@ -11,7 +11,7 @@ from anytouch_jax.evaluate import heads, probing, saved_heads, task_scores
 from anytouch_jax.evaluate.feature_cache import FeatureSource, FeatureStore
 from anytouch_jax.evaluate.heads import ProbeHead
 from anytouch_jax.evaluate.splits import RowRoles
-from anytouch_jax.evaluate.task_plans import Plan
+from anytouch_jax.evaluate.task_plans import TaskPlan
 from anytouch_jax.evaluate.tasks import Task, TaskRows
 
 WIDTH = 6
@@ -59,7 +59,7 @@ def test_the_components_of_pixels_are_those_of_rows_that_are_not_tested():
     everything = np.ones(count, bool)
     roles = RowRoles(y, groups, tested, everything, everything)
     task = Task("shape", "label.shape")
-    plan = Plan(task, rows, roles, np.array(["0", "1"]), 1, [])
+    plan = TaskPlan(task, rows, roles, np.array(["0", "1"]), 1, [])
     pixels = rng.standard_normal((count, 200)).astype(np.float32)
     others = np.where(tested[:, None], 50 * rng.standard_normal((count, 200)), pixels)
     seen = []

@@ -340,27 +340,14 @@ def public_names(source: str) -> list[str]:
     ]
 
 
-# Names that two rooms use, each for a thing of its own: a door and what lies behind it, a record of
-# a command and that of the function, a plan of probes and one of transforms. No new one may come.
+# Names that two modules use, and why both are right. No new one may come.
 USED_TWICE = {
-    "FitOptions",
-    "Measure",
-    "Plan",
-    "ProbeOptions",
-    "Scored",
-    "Start",
-    "TouchEncoder",
-    "Unit",
-    "cached_export",
-    "calibrate",
-    "choose_tokenizer",
-    "count_frames",
-    "fit_head",
-    "load_engine",
-    "moved",
-    "resolve",
-    "select_rows",
-    "warn",
+    "Measure": "the interface that the encoder knows, and the class of fields that has it",
+    "TouchEncoder": "the field's word for the network, and for the interface of every encoder",
+    "cached_export": "a door of the encoder, and what lies behind it",
+    "load_engine": "a door of the encoder, and what lies behind it",
+    "fit_head": "of a probe, and on the page by the touches that were taught",
+    "warn": "of a sentence for the user, and of an old name",
 }
 
 
@@ -371,8 +358,8 @@ def test_a_public_name_means_one_thing() -> None:
             if (module.rpartition(".")[0], name) not in BY_CONVENTION:
                 homes.setdefault(name, []).append(module)
     twice = {name for name, modules in homes.items() if len(modules) > 1}
-    assert twice <= USED_TWICE, "a name that is used twice for other things"
-    assert twice >= USED_TWICE, "a name that may leave the list"
+    assert twice <= USED_TWICE.keys(), "a name that is used twice for other things"
+    assert twice >= USED_TWICE.keys(), "a name that may leave the list"
 
 
 @pytest.mark.parametrize(

@@ -148,7 +148,7 @@ COMMANDS = {
         "Retrieve the same touch felt by another sensor, or search stored touches.",
     ),
     "sensor fit": Command(
-        "sensor:FitOptions",
+        "sensor:FitSensorOptions",
         "sensor:run_fit",
         "Fit the look of your sensor to 5 to 50 images of it, for the simulator.",
     ),

@@ -135,7 +135,14 @@ def print_help(kind: Any, name: str, default: Any = None) -> NoReturn:
 def make_record(
     kind: Any, default: Any, values: Mapping[tuple[str, ...], Any], path: tuple[str, ...] = ()
 ) -> Any:
-    """Return a record with `values` by the path of their field, and others as in `default`."""
+    """Return a record with `values` by the path of their field, and others as in `default`.
+
+    Args:
+        kind: the dataclass.
+        default: the record whose other values are kept.
+        values: by the path of their field, such as ("data", "batch_size").
+        path: of the record itself in the outermost one.
+    """
     changes = {}
     for one in fields(kind):
         own = (*path, one.name)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
-from anytouch_jax.cli.frame_files import count_frames
+from anytouch_jax.cli.frame_files import count_input_frames
 from anytouch_jax.cli.frame_files import log_if_cut as log_if_cut
 from anytouch_jax.cli.frame_files import numbered_frames as numbered_frames
 from anytouch_jax.cli.inputs import FrameOptions as FrameOptions
@@ -191,7 +191,7 @@ def _embed_frames(work: _Work, source: FramesInput) -> Features:
 
     features = embed_frames(
         work.inputs.encoder,
-        tracked(frames(), "frames embedded", count_frames(data)),
+        tracked(frames(), "frames embedded", count_input_frames(data)),
         source.row,
         source.preprocess,
         length=options.frames,

@@ -49,7 +49,7 @@ def log_if_cut(video: Path, count: int) -> None:
         )
 
 
-def count_frames(data: Path) -> int:
+def count_input_frames(data: Path) -> int:
     """Return the number of frames of a folder, a stack, an image or a video's header."""
     from anytouch_jax.data import images, stacks
 

@@ -322,7 +322,7 @@ def _run(path: Path) -> list[str]:
             [] if loss is None else [f"loss {loss:.4g}, the mean since the previous checkpoint"]
         )
     try:
-        checkpoint.checked(checkpoint.resolve(path, None))
+        checkpoint.checked(checkpoint.find_checkpoint(path, None))
     except checkpoint.CheckpointError as error:
         lines.append(str(error))
     return lines

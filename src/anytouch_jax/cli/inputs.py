@@ -220,7 +220,11 @@ def frames_input(
 ) -> FramesInput:
     """Return how the frames of `data` are prepared, and log the untouched gel.
 
-    `known` are images of the untouched gel that a head was fitted with.
+    Args:
+        encoder: whose features the frames are for.
+        options: of the command: sensor, background and orientation.
+        data: a folder, an image, a stack of frames or a video.
+        known: images of the untouched gel u8 (h, w, 3) that a head was fitted with, by name.
     """
     from anytouch_jax.data.background.rule import as_taken
     from anytouch_jax.encoder.contact_gate import ContactGate

@@ -260,7 +260,7 @@ def _of_frames(encoder: Encoder, options: MeasureOptions) -> Iterator[_Touch]:
     for number, name, frame in tracked(
         frame_files.numbered_frames(data, "error", times),
         "frames measured",
-        frame_files.count_frames(data),
+        frame_files.count_input_frames(data),
     ):
         assert frame is not None  # an unreadable one is an error
         frame = np.ascontiguousarray(orient_frame(frame, options.rotate, options.flip))

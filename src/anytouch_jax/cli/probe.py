@@ -23,14 +23,14 @@ from anytouch_jax.config.parsing import Count, Finite, NotNegative, Range
 from anytouch_jax.errors import UserError
 
 if TYPE_CHECKING:
-    from anytouch_jax.evaluate.options import ProbeOptions as Settings
+    from anytouch_jax.evaluate.options import ProbeOptions
 
-Record = TypeVar("Record", bound="Settings")
+Record = TypeVar("Record", bound="ProbeOptions")
 Inner = Annotated[float, Range(0.001, 0.999, "between 0.001 and 0.999")]
 
 
 @dataclass(frozen=True)
-class ProbeOptions:
+class SharedOptions:
     """The options that all probes share."""
 
     data: tuple[Path, ...]  # Manifests to probe on.
@@ -50,7 +50,7 @@ class ProbeOptions:
 
 
 @dataclass(frozen=True)
-class LabelOptions(ProbeOptions):
+class LabelOptions(SharedOptions):
     """Probe a label column with linear and kNN heads on frozen features.
 
     Example: anytouch probe label --model runs/stage1 --data manifest.csv --label object
@@ -97,7 +97,7 @@ class LabelOptions(ProbeOptions):
 
 
 @dataclass(frozen=True)
-class BatteryOptions(ProbeOptions):
+class BatteryOptions(SharedOptions):
     """The options that tasks and benchmarks share."""
 
     seeds: NotNegative[int] = 5  # Random splits of the groups.
@@ -262,7 +262,7 @@ def run_benchmark(options: BenchmarkOptions) -> int:
     return _print_tasks(options, results)
 
 
-def _prepare(options: ProbeOptions) -> None:
+def _prepare(options: SharedOptions) -> None:
     """Check where results go, before the work, and let programs that are compiled be kept."""
     from anytouch_jax.train.mesh import enable_compilation_cache
 
@@ -272,13 +272,13 @@ def _prepare(options: ProbeOptions) -> None:
     enable_compilation_cache()
 
 
-def _settings(options: ProbeOptions, kind: type[Record]) -> Record:
+def _settings(options: SharedOptions, kind: type[Record]) -> Record:
     """Return the options as the record of a probe, whose fields have the same names."""
     names = {field.name for field in fields(kind)}
     return kind(**{name: value for name, value in vars(options).items() if name in names})
 
 
-def _models(options: ProbeOptions) -> tuple[Path, ...]:
+def _models(options: SharedOptions) -> tuple[Path, ...]:
     """Return the encoders to probe: those named, or that of the package.
 
     Features of a file need no encoder.
@@ -288,7 +288,7 @@ def _models(options: ProbeOptions) -> tuple[Path, ...]:
     return (Path(DEFAULT),)
 
 
-def _files_read(options: ProbeOptions) -> tuple[Path, ...]:
+def _files_read(options: SharedOptions) -> tuple[Path, ...]:
     """Return the files of the options that no result may be written over."""
     records = []
     for run in options.model:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FitOptions:
+class FitSensorOptions:
     """Fit the look of your sensor to 5 to 50 images of it, for the simulator.
 
     Example: anytouch sensor fit pictures/ --name mine --width-mm 18.6 --out mine.sensor
@@ -43,7 +43,7 @@ class FitOptions:
     ball_mm: Above0[float | None] = None
 
 
-def run_fit(options: FitOptions) -> int:
+def run_fit(options: FitSensorOptions) -> int:
     """Fit a sensor and write its folder."""
     from anytouch_jax.data.images import decode, list_images, to_rgb
     from anytouch_jax.sim.fitting.fit import check_name, fit_sensor

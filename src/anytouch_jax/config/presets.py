@@ -29,11 +29,16 @@ def preset(
 ) -> Config:
     """Return the configuration called `name` (tiny, small, base, large) for a stage and a recipe.
 
-    `large` is the paper's. `towers` matters in stage 2 only: "scratch" trains small image and text
-    towers whole, "pretrained" expects CLIP weights, freezes the text tower and adapts the image
-    tower by LoRA. One point of the release depends on the machine and is set by hand: negatives
-    stay within a device's 64 rows, so `objective.groups` is 4 for a batch of 256. Raises
-    ConfigError for an unknown name or choice.
+    One point of the release depends on the machine and is set by hand: negatives stay within a
+    device's 64 rows, so `objective.groups` is 4 for a batch of 256. Raises ConfigError for an
+    unknown name or choice.
+
+    Args:
+        name: tiny, small, base or large, which is the paper's.
+        stage: 1 (masked and next-frame reconstruction) or 2 (alignment and matching).
+        recipe: "paper", or "release" for the settings of the authors' released code.
+        towers: of stage 2. "scratch" trains small image and text towers whole. "pretrained"
+            expects CLIP weights, freezes the text tower and adapts the image tower by LoRA.
     """
     if name not in _PRESETS:
         raise ConfigError(f"unknown preset {name!r}. Choose one of {', '.join(_PRESETS)}")

@@ -674,6 +674,12 @@ def sample_sheet(
     """Write an HTML page of `count` random captions with their images.
 
     Raises UserError without captions.
+
+    Args:
+        manifest: the frames.
+        captions: of groups of its rows.
+        path: of the page.
+        count: most captions on it.
     """
     if not captions:
         raise UserError("there are no captions to look at; leave out --sheet, or ask for some")

@@ -199,6 +199,13 @@ def find_caption_jobs(
     Rows of one touch share a caption. Rows without a touch share it by sequence. The RGB image of
     a group is that of its middle frame. Backgrounds and datasets without a prompt family are left
     out. Raises UserError if no caption is missing.
+
+    Args:
+        manifest: the frames.
+        split: only rows of this split, by default of all.
+        families: prompt families by the name of the dataset, beside the known ones.
+        overwrite: also captions that rows have.
+        second_image: column of the image beside the RGB image.
     """
     names = manifest.table.column_names
     if second_image not in (SECOND_IMAGE, *names):
@@ -314,9 +321,15 @@ def attach_text(
     """Add captions from a table (.csv or .parquet) with a key column and the column `text`; also
     return notes.
 
-    `key` is a column of both (default: the one other column of the table). Rows with a caption keep
-    it unless `overwrite`. Raises UserError for a table that lacks a column, has different captions
-    for a key, or matches no row.
+    Raises UserError for a table that lacks a column, has different captions for a key, or matches
+    no row.
+
+    Args:
+        manifest: the frames.
+        captions: the table.
+        key: a column of both, by default the one other column of the table.
+        text: the table's column of captions.
+        overwrite: also rows that have a caption, which keep theirs otherwise.
     """
     path = Path(captions).expanduser()
     caption_of, key = _read_captions(path, key, text)

@@ -97,6 +97,15 @@ def finding(
 ) -> Iterator[Finding]:
     """Yield a finding of `rows` if there are any: their number and `words`, with their values in
     `columns`.
+
+    Args:
+        manifest: the frames.
+        kind: a short name of the finding.
+        level: how bad it is.
+        rows: i64 (n,) that it is about.
+        words: what is said after their number.
+        columns: whose values the examples show.
+        column: that the finding is about, by default the first of `columns`.
     """
     if rows.size:
         examples = (

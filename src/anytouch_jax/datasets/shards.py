@@ -70,6 +70,13 @@ def pack(
     Files are stored unchanged and once each, so a loader reads the same batches. The same call
     continues after an interruption, and a finished pack is not changed. Raises PackError for a
     missing or empty file, and for a folder `out` with other contents.
+
+    Args:
+        manifest: the frames.
+        out: the folder.
+        shard_bytes: bytes of a shard, about.
+        threads: that read files.
+        log: takes a sentence on the progress.
     """
     folder = Path(out).expanduser().resolve()
     if shard_bytes < 1:

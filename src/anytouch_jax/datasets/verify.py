@@ -166,8 +166,11 @@ def verify(
 ) -> VerifyReport:
     """Check a manifest and every file that it names.
 
-    Without `decode`, files must only exist and not be empty. With `objects`, an object in two
-    learning splits is an error.
+    Args:
+        manifest: the frames.
+        decode: read every image; otherwise files must only exist and not be empty.
+        objects: an object in two learning splits is an error.
+        threads: that read files.
     """
     scanned = scans.scan(manifest, decode=decode, threads=threads)
     findings = [

@@ -253,6 +253,12 @@ def rows_with_gel(
     """Return those of `rows` that have an untouched gel, if the encoder needs one.
 
     Raises UserError if none has one.
+
+    Args:
+        encoder: whose training decides whether a gel is needed.
+        backgrounds: the untouched gels, if there are any.
+        rows: i64 (n,) of the manifest.
+        log: takes a sentence on the rows left out.
     """
     if not encoder.needs_background or backgrounds is None:
         return rows

@@ -26,6 +26,13 @@ def class_prototypes(
     """Return the class i32 of every row, -1 for none, and unit-norm prototypes f32 (classes, E).
 
     A prototype is the mean embedding of the known sensors' frames of its class in split train.
+
+    Args:
+        run: a run or weights, whose encoder embeds the frames.
+        manifest: the frames.
+        sensor: the new one, whose frames are in no prototype.
+        labels: the column of classes.
+        log: takes sentences of the encoder.
     """
     value = manifest.text_column(_class_column(manifest, labels))
     sensors = manifest.text_column("sensor")
@@ -86,7 +93,15 @@ def drop_without_gel(classes: np.ndarray, manifest: Manifest, sensor: str) -> No
 def measured_rows(
     manifest: Manifest, sensor: str, classes: np.ndarray, fitted: np.ndarray, seed: int
 ) -> tuple[np.ndarray, str]:
-    """Return rows on which the loss is measured, and what they are: of split val, or fitted."""
+    """Return rows on which the loss is measured, and what they are: of split val, or fitted.
+
+    Args:
+        manifest: the frames.
+        sensor: the new one.
+        classes: i32 (N,) of every row, -1 for none.
+        fitted: i64 (n,) rows that are trained on.
+        seed: of the choice among rows of val.
+    """
     is_sensor = manifest.text_column("sensor") == sensor
     is_val = manifest.text_column("split") == "val"
     count = min(int((is_sensor & is_val & (classes >= 0)).sum()), MEASURED)

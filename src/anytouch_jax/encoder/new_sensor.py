@@ -149,7 +149,14 @@ def put_tokens(params: Params, row: int, tokens: Any) -> Params:
 def metadata_of(
     loaded: Loaded, config: Config, sensor: str, source: dict[str, Any]
 ) -> dict[str, Any]:
-    """Return what the checkpoint of an adapted model says about it."""
+    """Return what the checkpoint of an adapted model says about it.
+
+    Args:
+        loaded: the model before.
+        config: of the model with the new sensor.
+        sensor: the new one.
+        source: what it was adapted from and by.
+    """
     stored = loaded.metadata if loaded.from_run else {}
     metadata: dict[str, Any] = {
         name: stored[name] for name in ("preprocessing", "data") if name in stored

@@ -102,8 +102,14 @@ def touch_sources(
 ) -> list[FeatureSource]:
     """Return features of the real touch and of the four controls.
 
-    "background only" is left out where rows have no background. `encoding` are fields of
-    `feature_cache.Encoding`.
+    "background only" is left out where rows have no background.
+
+    Args:
+        table: the frames.
+        encoder: whose features are computed.
+        cache: folder that keeps features by content.
+        log: takes a sentence on each source.
+        encoding: fields of `feature_cache.Encoding`.
     """
     backgrounds = Backgrounds(table)
     real = encoder_features(

@@ -175,6 +175,12 @@ def pixel_features(
     """Return raw pixels of the last frame, and every frame minus the background.
 
     Both are area averages of 24 x 32 x 3 in 0..1. They are the control that needs no network.
+
+    Args:
+        table: the frames.
+        order: of the frames in a clip.
+        folder: keeps features by content, None keeps nothing.
+        backgrounds: the untouched gels, by default those of the table.
     """
     known = backgrounds or Backgrounds(table)
     # Every image comes to one size first, so that devices with other resolutions, or with odd
@@ -376,6 +382,12 @@ def principal_components(
 
     Only rows of train decide the directions, as a component of test rows would be fitted on test.
     Raises UserError without any.
+
+    Args:
+        features: f32 (n, d).
+        train: bool (n,), rows that decide the directions.
+        components: most directions.
+        solver: of scikit-learn's PCA.
     """
     fitted = features[np.asarray(train, bool)]
     if not len(fitted):

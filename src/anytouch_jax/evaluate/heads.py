@@ -286,7 +286,11 @@ def fit_ridge(
 ) -> Predict:
     """Return a function from features (m, d) to ridge predictions (m,), one array a penalty.
 
-    A penalty is the factor of the squared weights beside the mean squared error.
+    Args:
+        x: f32 (n, d).
+        y: numbers (n,).
+        penalties: the factor of the squared weights beside the mean squared error, each.
+        scaling: "column" divides each column by its deviation, "common" all by one number.
     """
     # here, so that other heads are fitted without it
     from sklearn.linear_model import Ridge
@@ -407,7 +411,7 @@ def _gradient_step(
     return tuple(jax.enable_x64(False)(function) for function in (tx.init, jax.jit(step)))
 
 
-def calibrate(  # noqa: PLR0913 - a linear head's calibration reads all that a probe knows of rows
+def calibrate_head(  # noqa: PLR0913 - a linear head's calibration reads all that a probe knows of rows
     head: LinearHead,
     features: Array,
     y: Array,
@@ -468,7 +472,16 @@ def calibrate(  # noqa: PLR0913 - a linear head's calibration reads all that a p
 def linear_head(
     model: LinearModel, names: Array, *, label: str, pooling: Pooling, frames: int, fingerprint: str
 ) -> LinearHead:
-    """Return the head of a fitted `LinearModel`, whose class numbers index `names`."""
+    """Return the head of a fitted `LinearModel`, whose class numbers index `names`.
+
+    Args:
+        model: whose class numbers index `names`.
+        names: str (K,) of classes.
+        label: the column.
+        pooling: of the features it was fitted on.
+        frames: of a clip.
+        fingerprint: of the encoder.
+    """
     classes = np.asarray(names)[model.classes].astype(str)
     arrays = (classes, model.fit.weights, model.fit.bias, model.mean, model.scale)
     return LinearHead(*arrays, label, pooling, frames, fingerprint)

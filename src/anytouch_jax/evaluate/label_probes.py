@@ -10,7 +10,7 @@ from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder.arrays import Log
 from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import feature_cache, sources
-from anytouch_jax.evaluate.label_rows import constant_result, plan_rows, select_rows, task_of
+from anytouch_jax.evaluate.label_rows import constant_result, labelled_rows, plan_rows, task_of
 from anytouch_jax.evaluate.label_scores import cost_of, features_of, probe_source
 from anytouch_jax.evaluate.options import LabelProbeOptions, Models, Paths
 from anytouch_jax.evaluate.results import ProbeResult, probe_json
@@ -51,7 +51,7 @@ def probe_label(
         raise UserError(f"save writes the linear head of one model, not of {len(models)}.")
     table = manifests.read([str(path) for path in data])
     task = task_of(table, options)
-    rows = select_rows(table, task, options)
+    rows = labelled_rows(table, task, options)
     encoders = sources.opened(models)
     backgrounds = Backgrounds(table)
     plan = plan_rows(table, task, sources.with_gel(rows, backgrounds, encoders), options)

@@ -100,7 +100,7 @@ def task_of(table: Manifest, options: LabelProbeOptions) -> Task:
     return task
 
 
-def select_rows(table: Manifest, task: Task, options: LabelProbeOptions) -> TaskRows:
+def labelled_rows(table: Manifest, task: Task, options: LabelProbeOptions) -> TaskRows:
     """Return the rows with a label. Raises UserError if there are none, or none of a sensor."""
     rows = tasks.select(table, task, options.frames)
     known = np.unique(rows.sensors)
@@ -113,7 +113,14 @@ def select_rows(table: Manifest, task: Task, options: LabelProbeOptions) -> Task
 
 
 def plan_rows(table: Manifest, task: Task, rows: TaskRows, options: LabelProbeOptions) -> LabelPlan:
-    """Decide what is fitted on and tested. Raises UserError if nothing can be."""
+    """Decide what is fitted on and tested. Raises UserError if nothing can be.
+
+    Args:
+        table: the frames.
+        task: with the label and the group.
+        rows: that have the label.
+        options: of the probe.
+    """
     if options.train_sensor is not None and options.test_sensor is not None:
         return _between_sensors(task, rows, options, options.train_sensor, options.test_sensor)
     subsets = _subsets(table, task, rows, options.leave_out)

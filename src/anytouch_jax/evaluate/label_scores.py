@@ -48,7 +48,14 @@ def cost_of(x: Array, plan: LabelPlan, options: LabelProbeOptions) -> str:
 def probe_source(
     source: FeatureSource, x: Array, plan: LabelPlan, options: LabelProbeOptions
 ) -> list[ProbeResult]:
-    """Return the results of one source of features `x` (n, d), the linear head first."""
+    """Return the results of one source of features `x` (n, d), the linear head first.
+
+    Args:
+        source: what the features are of.
+        x: f32 (n, d).
+        plan: what is fitted on and tested.
+        options: of the probe.
+    """
     rows = plan.rows
     if plan.left_out:
         return [

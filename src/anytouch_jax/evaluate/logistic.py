@@ -88,7 +88,14 @@ def logistic_path(
 
 
 def path_seconds(x: Array, y: Array, classes: int, strongest: float) -> float:
-    """Estimate how long a path of five penalties takes, by the fit of the strongest one."""
+    """Estimate how long a path of five penalties takes, by the fit of the strongest one.
+
+    Args:
+        x: f32 (n, d), scaled.
+        y: class numbers i64 (n,).
+        classes: how many there are.
+        strongest: the largest penalty.
+    """
     took = []
     for _ in range(2):  # the first call in a process finds its libraries, too
         begun = time.perf_counter()

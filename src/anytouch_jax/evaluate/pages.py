@@ -101,8 +101,13 @@ def write_report(
 def html_page(text: str, folder: Path, title: str, reload: int = 0) -> str:
     """Return Markdown as one HTML page with the images of `folder`/figures inside.
 
-    A browser reads it again after `reload` seconds, unless they are 0. HTML in the Markdown is
-    shown as text, and no script runs.
+    HTML in the Markdown is shown as text, and no script runs.
+
+    Args:
+        text: Markdown.
+        folder: whose figures/ holds the images.
+        title: of the page.
+        reload: seconds after which a browser reads it again, 0 for never.
     """
     from markdown_it import MarkdownIt
 

@@ -171,6 +171,13 @@ def panels(
     """Return a figure and its grid of axes, each `width` x `height` inches.
 
     Raises UserError without any.
+
+    Args:
+        rows: of the grid.
+        columns: of the grid.
+        width: inches of one of its axes.
+        height: inches of one of its axes.
+        options: of the figure.
     """
     from matplotlib.figure import Figure
 

@@ -60,7 +60,15 @@ def pixel_scores(
 def clip_scores(
     params: Any, manifest: Manifest, ends: np.ndarray, *, net: Net, config: Config
 ) -> dict[str, np.ndarray]:
-    """Return the errors of `pixel_scores` of each clip (n,), in the order of `ends`."""
+    """Return the errors of `pixel_scores` of each clip (n,), in the order of `ends`.
+
+    Args:
+        params: of the network.
+        manifest: the frames.
+        ends: i64 (n,) rows that end the clips.
+        net: the network.
+        config: of its run.
+    """
     refuse_forked()
     parts = dict[str, list[np.ndarray]]()
     count = 0
@@ -88,7 +96,13 @@ def contact_errors(
 
     "gains" has for each term the best guess, by how much stage 1 is better, and the 95 % interval
     of that over objects. Frames without contact are the background in every patch, so they would
-    flatter everything. `ends` are the last rows of clips, of which at most 240 are scored.
+    flatter everything.
+
+    Args:
+        params: of the network.
+        manifest: the frames.
+        ends: i64 (n,) rows that end the clips, of which at most 240 are scored.
+        encoder: that the network is of.
     """
     # in contact or unknown
     ends = ends[known_contact(manifest)[ends] != 0]

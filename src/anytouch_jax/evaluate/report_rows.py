@@ -20,6 +20,12 @@ def chosen_touches(table: Manifest, split: str, touches: int, seed: int) -> Arra
     """Return the deepest rows of at most `touches` whole touches of a split.
 
     There are none of an empty train or val. An empty test raises UserError.
+
+    Args:
+        table: the frames.
+        split: train, val or test.
+        touches: most of them.
+        seed: of the choice.
     """
     if split != "test" and split not in set(table.text_column("split")):
         return np.zeros(0, np.int64)

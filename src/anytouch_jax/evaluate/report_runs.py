@@ -19,7 +19,14 @@ from anytouch_jax.evaluate.tables import markdown_table
 def runs_section(
     table: Manifest, runs: Mapping[str, Path], encoders: Mapping[str, Encoder], folder: Path
 ) -> Section:
-    """Return how much data of which sensors there is, and how both runs were trained."""
+    """Return how much data of which sensors there is, and how both runs were trained.
+
+    Args:
+        table: the frames.
+        runs: folders of "stage 1" and "stage 2".
+        encoders: of "stage 1" and "stage 2".
+        folder: of the report, for figures.
+    """
     first = encoders["stage 1"]
     second = encoders["stage 2"]
     path = folder / "figures" / "losses.png"

@@ -43,7 +43,15 @@ class Study:
 def study_of(
     table: Manifest, encoders: Mapping[str, Encoder], touches: int, seed: int, log: Log
 ) -> Study:
-    """Embed at most `touches` of test, and half as many of train and of val, by each encoder."""
+    """Embed at most `touches` of test, and half as many of train and of val, by each encoder.
+
+    Args:
+        table: the frames.
+        encoders: by name.
+        touches: most of split test.
+        seed: of the choice.
+        log: takes a sentence on each encoder.
+    """
     most = {"train": touches // 2, "val": touches // 2, "test": touches}
     rows = np.concatenate(
         [chosen_touches(table, name, count, seed) for name, count in most.items()]

@@ -635,6 +635,13 @@ def draw_triples(
     """Return places in `rows` of anchors, positives and negatives, i64 (m,), drawn as in training.
 
     Raises UserError.
+
+    Args:
+        manifest: the frames.
+        rows: i64 (n,) of the gallery.
+        negatives: what a negative is drawn from.
+        draws: of each anchor.
+        seed: of the draws.
     """
     names = ("touch", "sensor", "unit", "object", "dataset")
     keys = MatchKeys(*(manifest.codes(name, own=name == "touch") for name in names))

@@ -29,6 +29,15 @@ def save_probed(
     """Write the linear head that a result was scored with, calibrated on rows it has not seen.
 
     Where groups were left out in turn it is fitted on all rows.
+
+    Args:
+        source: what the features are of.
+        x: f32 (n, d).
+        rows: that have the label.
+        result: of the probe, with the selected penalty.
+        options: of the probe; `save` is the file.
+        backgrounds: the untouched gels, which go into the file.
+        log: takes a sentence on the head.
     """
     path = options.save
     encoder = source.encoder
@@ -89,7 +98,7 @@ def calibrated(
     numbers = np.unique(rows.labels, return_inverse=True)[1]
     try:
         folds = splits.group_folds(fit, rows.groups, numbers, splits.FOLDS)
-        head = heads.calibrate(
+        head = heads.calibrate_head(
             head, x, rows.labels, rows.groups, rows.sensors, fit, val, folds, penalty, **limits
         )
     except UserError as error:

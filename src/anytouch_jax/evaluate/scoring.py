@@ -31,8 +31,13 @@ def predict(
 ) -> Prediction:
     """Select an option of a head, fit it, and predict the test rows of the split.
 
-    With `refit` it is fitted again without a start, so that the weights do not depend on the other
-    options. Otherwise the fit of the selection serves if it has seen all rows of train.
+    Args:
+        data: features, labels and groups of all rows.
+        cut: rows of train, val and test.
+        head: kind of head.
+        protocol: how the option is selected.
+        refit: fit again without a start, so that the weights do not depend on the other
+            options. Otherwise the fit of the selection serves if it has seen all rows of train.
     """
     selected = splits.select_option(head, data, cut, protocol)
     fitted = selected.fitted

@@ -89,7 +89,14 @@ def fraction_text(value: float | None) -> str:
 def interval_text(
     low: float | None, high: float | None, factor: float = 100.0, digits: int = 1
 ) -> str:
-    """Return an interval as text, "-" if there is none; fractions are in points by default."""
+    """Return an interval as text, "-" if there is none; fractions are in points by default.
+
+    Args:
+        low: its lower end, None without an interval.
+        high: its upper end.
+        factor: of the numbers shown.
+        digits: after the point.
+    """
     if low is None or high is None:
         return "-"
     return f"{factor * low:.{digits}f} to {factor * high:.{digits}f}"
@@ -98,7 +105,14 @@ def interval_text(
 def score_text(
     value: float, low: float | None = None, high: float | None = None, *, difference: bool = False
 ) -> str:
-    """Return a fraction in percent, or a difference in points with its sign, and its interval."""
+    """Return a fraction in percent, or a difference in points with its sign, and its interval.
+
+    Args:
+        value: the fraction or difference.
+        low: lower end of its interval, None without one.
+        high: upper end.
+        difference: whether it is a difference.
+    """
     sign = "+" if difference else ""
     text = f"{100 * value:{sign}.1f}"
     if not difference:

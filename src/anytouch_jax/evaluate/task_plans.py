@@ -16,7 +16,7 @@ from anytouch_jax.evaluate.splits import SIDES, RowRoles
 from anytouch_jax.evaluate.tasks import Task, TaskRows
 
 
-class Plan(NamedTuple):
+class TaskPlan(NamedTuple):
     """A task with the rows that can be fitted on or tested.
 
     `roles` and class `names` are of the rows, and `frames` is the length of a clip.
@@ -36,12 +36,19 @@ def plan_tasks(
     options: TaskProbeOptions,
     among: Callable[[TaskRows], TaskRows],
     log: Log,
-) -> tuple[list[Plan], dict[str, str]]:
+) -> tuple[list[TaskPlan], dict[str, str]]:
     """Return the plans of the tasks that can be probed, and why the others cannot.
 
     Raises UserError if none can.
+
+    Args:
+        table: the frames.
+        names: of tasks, or tasks.
+        options: of the probe.
+        among: chooses some of a task's rows.
+        log: takes a sentence on what is left out.
     """
-    plans = list[Plan]()
+    plans = list[TaskPlan]()
     left_out = dict[str, str]()
     if names == "all" or list(names) == ["all"]:
         names = tasks.available_tasks(table)
@@ -85,7 +92,7 @@ def _plan(
     task: Task,
     options: TaskProbeOptions,
     among: Callable[[TaskRows], TaskRows],
-) -> Plan:
+) -> TaskPlan:
     """Select the rows of a task that can be fitted on or tested, at most `max_rows` of them.
 
     Raises UserError.
@@ -113,4 +120,4 @@ def _plan(
     if scheme == "split" and not roles.regression:
         notes += splits.unlearned_note(roles.y[roles.tested], roles.y[roles.fitted], names)
     notes = [note for note in notes if note]
-    return Plan(task, rows, roles, names, options.frames or task.frames, notes)
+    return TaskPlan(task, rows, roles, names, options.frames or task.frames, notes)

@@ -19,7 +19,7 @@ from anytouch_jax.errors import UserError
 from anytouch_jax.evaluate import feature_cache, sources, tasks
 from anytouch_jax.evaluate.feature_cache import FeatureSource
 from anytouch_jax.evaluate.options import Models, Paths, TaskProbeOptions, Tasks
-from anytouch_jax.evaluate.task_plans import Plan, plan_tasks
+from anytouch_jax.evaluate.task_plans import TaskPlan, plan_tasks
 from anytouch_jax.evaluate.task_scores import score_source
 from anytouch_jax.evaluate.tasks import TaskRows
 from anytouch_jax.evaluate.verdicts import Runs, task_verdicts
@@ -137,7 +137,7 @@ def probe_benchmark(
 def _sources(
     table: Manifest,
     opened: sources.Opened,
-    plans: Sequence[Plan],
+    plans: Sequence[TaskPlan],
     options: TaskProbeOptions,
     backgrounds: Backgrounds,
     log: Log,

@@ -19,14 +19,14 @@ from anytouch_jax.evaluate.options import TaskProbeOptions
 from anytouch_jax.evaluate.scoring import constant_prediction, predict, score_sums
 from anytouch_jax.evaluate.splits import LabelledFeatures
 from anytouch_jax.evaluate.statistics import GroupSums, Protocol
-from anytouch_jax.evaluate.task_plans import Plan
+from anytouch_jax.evaluate.task_plans import TaskPlan
 from anytouch_jax.evaluate.verdicts import Runs
 from anytouch_jax.progress import tracked
 
 
 def score_source(
     source: FeatureSource,
-    plans: Sequence[Plan],
+    plans: Sequence[TaskPlan],
     options: TaskProbeOptions,
     runs: Runs,
     log: Log = lambda _: None,
@@ -73,7 +73,7 @@ def score_source(
     return results
 
 
-def _labelled(source: FeatureSource, plan: Plan) -> LabelledFeatures:
+def _labelled(source: FeatureSource, plan: TaskPlan) -> LabelledFeatures:
     """Return the features and labels of a task; of raw pixels their principal components."""
     x = source.store.get(plan.rows.rows, plan.frames)
     if not np.isfinite(x).all():
@@ -101,7 +101,7 @@ class _Tally:
 
 
 def _score(
-    data: LabelledFeatures, plan: Plan, head: ProbeHead, protocol: Protocol, seeds: int
+    data: LabelledFeatures, plan: TaskPlan, head: ProbeHead, protocol: Protocol, seeds: int
 ) -> tuple[dict[str, Any], list[GroupSums]]:
     """Score a head on all splits of all seeds. Return the test rows of each seed, too."""
     roles = plan.roles

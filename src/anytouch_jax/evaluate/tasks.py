@@ -297,6 +297,12 @@ def described_subsets(table: Manifest, column: str, rows: Array, name: str) -> d
     """Return masks over `rows` (n,): values of `column` that alignment may have named, and others.
 
     Those are values with an RGB image or caption in train. {} if all values are of one kind.
+
+    Args:
+        table: the frames.
+        column: whose values are divided.
+        rows: i64 (n,).
+        name: of the subsets in tables.
     """
     values = table.text_column(column)
     described = (table.present("image_path") | table.present("text")) & (

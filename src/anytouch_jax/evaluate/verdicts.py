@@ -20,7 +20,7 @@ Runs = dict[tuple[str, ...], list[GroupSums]]
 Gain = Mapping[str, float | None]
 
 
-class Scored(NamedTuple):
+class ScoredHead(NamedTuple):
     """A head on one set of features: its test rows, one for each seed."""
 
     features: str
@@ -36,7 +36,7 @@ class Scored(NamedTuple):
             return f"the {self.features}"
         return f"{self.features} ({self.head})"
 
-    def gain(self, other: Scored, regression: bool) -> dict[str, float | None]:
+    def gain(self, other: ScoredHead, regression: bool) -> dict[str, float | None]:
         """Return by how much it is above another one, with the paired interval."""
         return statistics.paired_gain(self.runs, other.runs, regression)
 
@@ -84,7 +84,7 @@ def _interval(gain: Gain, regression: bool) -> str:
     return f"({100 * low:.0f} to {100 * high:.0f})"
 
 
-def _untrained(own: Scored, untrained: Scored, task: str, regression: bool) -> str:
+def _untrained(own: ScoredHead, untrained: ScoredHead, task: str, regression: bool) -> str:
     """Return a sentence where an untrained encoder is above a trained one, else "".
 
     Then what the score shows is the architecture and the images, not what training has taught.
@@ -101,9 +101,16 @@ def _untrained(own: Scored, untrained: Scored, task: str, regression: bool) -> s
 
 
 def sentences(
-    own: Scored, controls: Sequence[Scored], task: str = "", regression: bool = False
+    own: ScoredHead, controls: Sequence[ScoredHead], task: str = "", regression: bool = False
 ) -> list[str]:
-    """Return what is to say of a head on features of a user, beside the controls of a probe."""
+    """Return what is to say of a head on features of a user, beside the controls of a probe.
+
+    Args:
+        own: the head on the user's features.
+        controls: on raw pixels, a random encoder and so on.
+        task: what was probed, if there are several tasks.
+        regression: whether scores are R2, not accuracies.
+    """
     if not controls:
         return []
     # the control over which the features gain least
@@ -126,8 +133,8 @@ def label_verdicts(results: Sequence[ProbeResult]) -> list[str]:
     A source is judged by its first head, the linear one. Controls are judged by all: a user may
     take whichever is best. The commonest class, or the mean of train, is one of them.
     """
-    scored: list[Scored] = []
-    constants: list[Scored] = []
+    scored: list[ScoredHead] = []
+    constants: list[ScoredHead] = []
     regression = False
     for result in results:
         if result.outcome is None:
@@ -135,9 +142,9 @@ def label_verdicts(results: Sequence[ProbeResult]) -> list[str]:
         regression = result.regression
         features, has_head, head = result.probe.rpartition(": ")
         if has_head:
-            scored.append(Scored(features, head, [result.outcome.sums]))
+            scored.append(ScoredHead(features, head, [result.outcome.sums]))
         else:
-            constants.append(Scored(result.probe, "", [result.outcome.sums]))
+            constants.append(ScoredHead(result.probe, "", [result.outcome.sums]))
     controls = [one for one in scored if one.features in CONTROLS]
     if controls:
         controls += constants
@@ -162,6 +169,6 @@ def task_verdicts(runs: Runs, kinds: Mapping[str, bool]) -> list[str]:
         controls = []
         for (name, other_task, other_head, other_protocol), several in runs.items():
             if name in CONTROLS and (other_task, other_protocol) == (task, protocol):
-                controls.append(Scored(name, other_head, several))
-        lines += sentences(Scored(features, head, own), controls, task, kinds[task])
+                controls.append(ScoredHead(name, other_head, several))
+        lines += sentences(ScoredHead(features, head, own), controls, task, kinds[task])
     return lines

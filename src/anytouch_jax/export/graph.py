@@ -86,7 +86,14 @@ class Graph:
         return self("LayerNormalization", x, params["scale"], params["bias"], axis=-1, epsilon=eps)
 
     def part_of(self, x: str, start: int, stop: int, axis: int) -> str:
-        """Take places from `start` to `stop` of an axis."""
+        """Take places from `start` to `stop` of an axis.
+
+        Args:
+            x: name of an array.
+            start: first place.
+            stop: place after the last.
+            axis: whose places they are.
+        """
         return self("Slice", x, [start], [stop], [axis])
 
     def one_of(self, x: str, at: int, axis: int) -> str:

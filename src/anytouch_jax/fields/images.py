@@ -39,6 +39,12 @@ def overlay(frame: Array, measured: Fields, row: int = 0, *, text: bool = True) 
 
     Depth is in colour, the rim of contact is white, arrows are shear that is longer than its
     deviation, and force and depth are written as `text`.
+
+    Args:
+        frame: u8 (h, w, 3), oriented.
+        measured: fields of N frames.
+        row: of the frame among them.
+        text: write force and depth on it.
     """
     height, width = frame.shape[:2]
     one = measured[row].at(height, width)
@@ -89,6 +95,12 @@ def write_surface(path: Path, frame: Array, measured: Fields, row: int = 0) -> N
 
     Its frame is the right-handed one of `Fields.points`, which a comment in the file says. Faces
     turn their front away from the camera, to where the object is.
+
+    Args:
+        path: of the .ply file.
+        frame: u8 (h, w, 3), oriented.
+        measured: fields of N frames.
+        row: of the frame among them.
     """
     height = max(frame.shape[0] // _EDGE, 2)
     width = max(frame.shape[1] // _EDGE, 2)

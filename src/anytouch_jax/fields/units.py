@@ -17,7 +17,7 @@ DEVIATION = "sqrt(2) * exp(5 * tanh(x / 5))"
 _USUAL = {"width_mm": 20.0, "modulus_kpa": 170.0, "aspect": round(math.log(0.75), 4)}
 
 
-class Unit(NamedTuple):
+class Quantity(NamedTuple):
     """A value with its unit, and its formula in Python by outputs of the model.
 
     A formula uses the width that the image shows, `width_mm`, the modulus of the gel,
@@ -28,7 +28,7 @@ class Unit(NamedTuple):
     formula: str
 
 
-def units_of(scale: Scale) -> dict[str, Unit]:
+def units_of(scale: Scale) -> dict[str, Quantity]:
     """Return the values by name, with the factors on deviations of a scale."""
     factors = {name: f"{factor:.6g}" for name, factor in scale.factors.items()}
     newton = "modulus_kpa * width_mm**2 / 1000"
@@ -40,21 +40,21 @@ def units_of(scale: Scale) -> dict[str, Unit]:
         "deviation(force_log[:, 1:])"
     )
     return {
-        "depth": Unit("mm into the gel", "width_mm * depth"),
-        "depth_std": Unit("mm", f"{length} * {factors['depth']} * deviation(depth_log)"),
-        "shear": Unit("mm along x and y of the image", "width_mm * shear"),
-        "shear_std": Unit("mm", f"{length} * {factors['shear']} * deviation(shear_log)"),
-        "contact": Unit("probability", "1 / (1 + exp(-contact))"),
-        "pressure": Unit("kPa", "modulus_kpa * pressure"),
-        "force": Unit("N along x, along y and into the gel", f"{newton} * force"),
-        "tangential_std": Unit("N, of the first two", tangential),
-        "normal_std": Unit("N, of the third", normal),
-        "torque": Unit("N mm, from x to y", f"{newton_mm} * torque"),
-        "torque_std": Unit(
+        "depth": Quantity("mm into the gel", "width_mm * depth"),
+        "depth_std": Quantity("mm", f"{length} * {factors['depth']} * deviation(depth_log)"),
+        "shear": Quantity("mm along x and y of the image", "width_mm * shear"),
+        "shear_std": Quantity("mm", f"{length} * {factors['shear']} * deviation(shear_log)"),
+        "contact": Quantity("probability", "1 / (1 + exp(-contact))"),
+        "pressure": Quantity("kPa", "modulus_kpa * pressure"),
+        "force": Quantity("N along x, along y and into the gel", f"{newton} * force"),
+        "tangential_std": Quantity("N, of the first two", tangential),
+        "normal_std": Quantity("N, of the third", normal),
+        "torque": Quantity("N mm, from x to y", f"{newton_mm} * torque"),
+        "torque_std": Quantity(
             "N mm", f"{newton_mm} * {TORQUE} * {factors['torque']} * deviation(torque_log)"
         ),
-        "slip": Unit("fraction of the contact that slides", "1 / (1 + exp(-slip))"),
-        "slip_std": Unit("fraction", f"minimum({factors['slip']} * deviation(slip_log), 1)"),
+        "slip": Quantity("fraction of the contact that slides", "1 / (1 + exp(-slip))"),
+        "slip_std": Quantity("fraction", f"minimum({factors['slip']} * deviation(slip_log), 1)"),
     }
 
 

@@ -56,7 +56,17 @@ def tune(
     ended: Callable[[], bool],
     log: Log,
 ) -> TuneResult:
-    """Fit the linear head, train from it, and return whichever is better."""
+    """Fit the linear head, train from it, and return whichever is better.
+
+    Args:
+        encoder: that is trained from.
+        touches: features, labels and frames of all rows.
+        chosen: the target and the parts of the rows.
+        options: of the training.
+        clock: knows when the time is over, and shows the progress.
+        ended: says whether the user has asked to end.
+        log: takes a sentence on each part.
+    """
     target = chosen.target
     parts = chosen.parts
     clock.show()

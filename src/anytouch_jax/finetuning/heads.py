@@ -30,7 +30,14 @@ class HeadRows(NamedTuple):
 
 
 def make_head(linear: Linear, given: HeadRows, options: FinetuneOptions, log: Log) -> Head:
-    """Return the head of a linear function, calibrated, and log what it promises."""
+    """Return the head of a linear function, calibrated, and log what it promises.
+
+    Args:
+        linear: weights and bias on scaled features.
+        given: rows to calibrate on.
+        options: of the training.
+        log: takes what the head promises.
+    """
     common: dict[str, Any] = {
         "bias": linear.bias,
         "mean": linear.mean,

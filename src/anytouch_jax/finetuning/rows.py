@@ -11,7 +11,7 @@ from anytouch_jax.data.manifest.manifest import Manifest
 from anytouch_jax.encoder.arrays import Array, Log
 from anytouch_jax.encoder.base import Encoder
 from anytouch_jax.evaluate import sources
-from anytouch_jax.evaluate.label_rows import select_rows, task_of
+from anytouch_jax.evaluate.label_rows import labelled_rows, task_of
 from anytouch_jax.evaluate.options import LabelProbeOptions
 from anytouch_jax.evaluate.tasks import TaskRows
 from anytouch_jax.finetuning.options import FinetuneOptions
@@ -57,7 +57,7 @@ def choose_rows(
         regression=options.regression,
     )
     task = task_of(table, probe)
-    rows = sources.with_gel(select_rows(table, task, probe), backgrounds, [encoder])
+    rows = sources.with_gel(labelled_rows(table, task, probe), backgrounds, [encoder])
     count = len(rows.rows)
     if count > MOST_ROWS:
         rows = rows.take(_thinned(rows.groups))

@@ -88,7 +88,14 @@ class Net:
     def encode_poolings(
         self, params: Params, clip: Array, sensor: Array, aggregation: str = "mean"
     ) -> tuple[Array, Array]:
-        """Return both poolings (B, E) in one pass: class token, and mean over patch tokens."""
+        """Return both poolings (B, E) in one pass: class token, and mean over patch tokens.
+
+        Args:
+            params: Of the network.
+            clip: Normalised frames (B, T, H, W, 3).
+            sensor: Rows i32 (B,) of the sensor table.
+            aggregation: How the segments of a longer clip are joined.
+        """
         return self.bind(params).encode_poolings(clip, sensor, aggregation)
 
     def encode_sight(
@@ -97,6 +104,12 @@ class Net:
         """Return values (B, model.sight) of the last frame of normalised clips, see `nn.sight`.
 
         Those of a clip (B, T, H, W, 3) of several segments are aggregated as in `encode_touch`.
+
+        Args:
+            params: Of the network.
+            clip: Normalised frames (B, T, H, W, 3).
+            sensor: Rows i32 (B,) of the sensor table.
+            aggregation: How the segments of a longer clip are joined.
         """
         return self.bind(params).encode_sight(clip, sensor, aggregation)
 
@@ -106,6 +119,12 @@ class Net:
         """Return the projected sequence (B, 1 + S + K, E), the decoder's input.
 
         It is [class, sensor tokens, patches].
+
+        Args:
+            params: Of the network.
+            clip: Normalised frames (B, T, H, W, 3).
+            sensor: Rows i32 (B,) of the sensor table.
+            keep_ids: i32 (B, K) of the visible patches, None for all.
         """
         return self.bind(params).encode_tokens(clip, sensor, keep_ids)
 
@@ -137,15 +156,27 @@ class Net:
     def measure(self, params: Params, clip: Array, sensor: Array, aspect: Array) -> FieldOutput:
         """Return depth, shear, contact and force of normalised clips (B, T, H, W, 3).
 
-        `aspect` (B,) is the logarithm of the height over the width that the image shows. The
-        result is free of scale.
+        The result is free of scale.
+
+        Args:
+            params: Of the network.
+            clip: Normalised frames (B, T, H, W, 3).
+            sensor: Rows i32 (B,) of the sensor table.
+            aspect: (B,), the logarithm of the height over the width that the image shows.
         """
         return self.bind(params).measure(clip, sensor, aspect)
 
     def encode_and_measure(
         self, params: Params, clip: Array, sensor: Array, aspect: Array
     ) -> tuple[Array, Array, FieldOutput]:
-        """Return both poolings (B, E) and the fields of clips of one segment, in one pass."""
+        """Return both poolings (B, E) and the fields of clips of one segment, in one pass.
+
+        Args:
+            params: Of the network.
+            clip: Normalised frames (B, T, H, W, 3), of one segment.
+            sensor: Rows i32 (B,) of the sensor table.
+            aspect: (B,), the logarithm of the height over the width that the image shows.
+        """
         return self.bind(params).encode_and_measure(clip, sensor, aspect)
 
     def encode_image(self, params: Params, image: Array) -> Array:

@@ -213,7 +213,15 @@ class Attention(nnx.Module):
         return cut(self.query(asks)), cut(self.key(x)), cut(self.value(x))
 
     def attend(self, q: Array, k: Array, v: Array, *, causal: bool, mask: Array | None) -> Array:
-        """Return (B, Q, H, D / H). `mask` (B, S) bool marks the keys to read."""
+        """Return (B, Q, H, D / H). `mask` (B, S) bool marks the keys to read.
+
+        Args:
+            q: Queries (B, Q, H, D / H).
+            k: Keys (B, S, H, D / H).
+            v: Values (B, S, H, D / H).
+            causal: Whether a query reads keys up to its own place only.
+            mask: bool (B, S), the keys to read; None for all.
+        """
         return attention(q, k, v, implementation=self.implementation, causal=causal, mask=mask)
 
 
@@ -279,7 +287,15 @@ class Block(nnx.Module):
 def stacked_blocks(
     stack: Stack, model: ModelConfig, eps: float, act: Activation, kind: type[Block] = Block
 ) -> Block:
-    """Return `stack.depth` blocks as one, every parameter with a leading axis of that length."""
+    """Return `stack.depth` blocks as one, every parameter with a leading axis of that length.
+
+    Args:
+        stack: Width, depth, heads and hidden width.
+        model: The rest of the settings, such as the dtype.
+        eps: Of the norms.
+        act: Of the hidden layer.
+        kind: Of block.
+    """
     return nnx.vmap(lambda: kind(stack, model, eps, act), axis_size=stack.depth)()
 
 

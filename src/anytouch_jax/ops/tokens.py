@@ -111,7 +111,13 @@ def draw_tokens(
 ) -> Array:
     """Replace a sensor's row by the universal one where `uniform` < p_u (Eq. 7).
 
-    `sensor` i32 (B,), `uniform` (B,) in [0, 1). Returns rows i32 (B,) of the sensor-token table.
+    Returns rows i32 (B,) of the sensor-token table.
+
+    Args:
+        sensor: rows i32 (B,) of the sensor-token table.
+        uniform: draws (B,) in [0, 1).
+        probability: p_u of this step.
+        universal_row: the row that all sensors share.
     """
     is_universal = jnp.asarray(uniform, float) < jnp.asarray(probability, float)
     return jnp.where(is_universal, universal_row, jnp.asarray(sensor))

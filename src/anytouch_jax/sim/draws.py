@@ -119,6 +119,12 @@ def either(rng: Rng, condition: Any, draw: Callable[[], Any], otherwise: Any) ->
     """Return `draw()` if the condition holds, else `otherwise`.
 
     numpy draws only then. JAX always draws, because a traced condition is not known.
+
+    Args:
+        rng: of numpy, or the one of this module for JAX.
+        condition: a bool, traced under JAX.
+        draw: called for the value.
+        otherwise: the value if the condition does not hold.
     """
     if isinstance(rng, Draws):
         return jnp.where(condition, draw(), otherwise)

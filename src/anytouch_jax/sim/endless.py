@@ -44,8 +44,8 @@ from anytouch_jax.sim.scene import (
     draw_by_hand,
     draw_gesture,
     draw_place,
-    moved,
     objects_and_splits,
+    trajectory_at,
 )
 from anytouch_jax.sim.sensing.optics import Photometry
 from anytouch_jax.sim.sensing.own import find_sensor
@@ -241,7 +241,11 @@ def make_world(
 ) -> World:
     """Return the world of these objects and sensors, as numpy arrays.
 
-    `places` of each object can be photographed.
+    Args:
+        things: the objects.
+        sensors: names of the table, or folders of fitted ones.
+        places: of each object that can be photographed.
+        seed: of the places.
     """
     reliefs = over_cores(
         partial(shapes.relief, pixels=RELIEF, pitch=SPACING), [thing.shape for thing in things]
@@ -273,10 +277,16 @@ def over_cores(work: Callable[[_Item], _Result], items: Sequence[_Item]) -> list
 def sample_touches(
     key: Array, world: World, sampling: Sampling, count: int, gallery: Array | None = None
 ) -> SimulatedTouches:
-    """Return `count` touches drawn from `key`. `sampling` and `count` are static under jit.
+    """Return `count` touches drawn from `key`.
 
-    The second take is by the family `gallery`, if given. A key gives the same touches on one
-    machine.
+    A key gives the same touches on one machine.
+
+    Args:
+        key: of the draws.
+        world: objects and sensors.
+        sampling: how touches are drawn; static under jit.
+        count: of touches; static under jit.
+        gallery: number of the family that takes the second take, if given.
     """
     return simulate_drawn(draw_touches(key, world, sampling, count, gallery), sampling)
 
@@ -384,7 +394,7 @@ def _draw_take(
     hand = draw_by_hand(sampling.depth, rng, shared.gesture, shared.yaw)
     straight = (shared.gesture, shared.yaw, jnp.zeros(2), jnp.zeros(2))
     own, turn, offset, tilt = jax.tree.map(partial(jnp.where, shared.by_hand), hand, straight)
-    motion, depth = moved(own, _times(own, sampling.frames, rng), 0.04, jnp)
+    motion, depth = trajectory_at(own, _times(own, sampling.frames, rng), 0.04, jnp)
     # A clip that would show no contact shows the deepest press instead.
     depth = jnp.where(jnp.max(depth) < LEAST_DEPTH, own.depth, depth)
     depth = jnp.where(rng.uniform() < sampling.free, -1.0, depth)

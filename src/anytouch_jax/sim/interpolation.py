@@ -118,6 +118,12 @@ def sample_sharp(raster: Leaf, pitch: float, x: jax.Array, y: jax.Array) -> jax.
     Along each axis a value stays between its two neighbours, but for the room that a gentle bend on
     both sides of them leaves (`_limited`). So a plateau stays one up to its very edge, and a smooth
     surface is the same as by `sample`: parabolas are exact.
+
+    Args:
+        raster: (H, W) values.
+        pitch: mm between pixels.
+        x: places to the right of the middle, mm.
+        y: places below the middle, mm, of the shape of `x`.
     """
     columns = raster.shape[1]
     near = _neighbours(raster, pitch, x, y)
@@ -132,7 +138,14 @@ def sample_sharp(raster: Leaf, pitch: float, x: jax.Array, y: jax.Array) -> jax.
 
 
 def sample_nearest(raster: Leaf, pitch: float, x: jax.Array, y: jax.Array) -> jax.Array:
-    """Return the values of the pixels nearest to points, for one read of each; see `sample`."""
+    """Return the values of the pixels nearest to points, for one read of each; see `sample`.
+
+    Args:
+        raster: (H, W) values.
+        pitch: mm between pixels.
+        x: places to the right of the middle, mm.
+        y: places below the middle, mm, of the shape of `x`.
+    """
     rows, columns = raster.shape
     down = jnp.nan_to_num(jnp.asarray(y) / pitch + (rows - 1) / 2, nan=-1.0)
     across = jnp.nan_to_num(jnp.asarray(x) / pitch + (columns - 1) / 2, nan=-1.0)

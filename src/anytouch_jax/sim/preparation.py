@@ -73,7 +73,12 @@ def prepared(
 ) -> Array:
     """Return clips u8 (B, T, S, S, 3), the background (B, S, S, 3) subtracted or not.
 
-    `jitter` changes brightness and colours, about the grey of an untouched gel.
+    Args:
+        key: of the jitter.
+        clip: u8 (B, T, S, S, 3).
+        background: u8 (B, S, S, 3), the untouched gels.
+        config: says whether the background is subtracted, and how strong the jitter is.
+        jitter: change brightness and colours, about the grey of an untouched gel.
     """
     settings = TouchAugmentation.of(config.data)
     choice, light = jax.random.split(key)
@@ -117,7 +122,14 @@ def field_batch(
 
     Lengths are over the width of the image, pressure is over the gel's modulus, and forces are
     over modulus times width squared. So a gel of twice the size that is touched by an object of
-    twice the size has the same fields. `sensor` (B, M) are rows of the sensor table.
+    twice the size has the same fields.
+
+    Args:
+        key: of the preparation.
+        touches: simulated, of M takes each.
+        sensor: rows (B, M) of the sensor table.
+        config: of the run.
+        count: of touches with fields.
     """
     assert touches.fields is not None
     clip = touches.clip[:count, -1, -config.model.frames :]

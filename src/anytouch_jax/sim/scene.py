@@ -220,6 +220,12 @@ def draw_by_hand(
     """Return another sensor's gesture, yaw, offset and tilt at a touch of grade coarse.
 
     The offset is (2,) mm, the tilt (2,) in rise per mm.
+
+    Args:
+        depths: range of the depth, mm.
+        rng: of the recording.
+        gesture: of the touch.
+        yaw: of the touch, rad.
     """
     gesture = draw_gesture(depths, rng, gesture)
     yaw = yaw + math.radians(12) * rng.standard_normal()
@@ -280,13 +286,17 @@ def trajectory(frames: int, gesture: Gesture) -> tuple[Leaf, Leaf]:
     times = gesture.middle + gesture.shown * np.linspace(-0.5, 0.5, frames)
     # A lift shorter than a frame would not be seen.
     gap = max(0.04, gesture.shown / (frames - 1) / 2)
-    return moved(gesture, times, gap, np)
+    return trajectory_at(gesture, times, gap, np)
 
 
-def moved(gesture: Gesture, times: Leaf, gap: Scalar, xp: ModuleType) -> tuple[Leaf, Leaf]:
+def trajectory_at(gesture: Gesture, times: Leaf, gap: Scalar, xp: ModuleType) -> tuple[Leaf, Leaf]:
     """Return motion (T, 3) and depth (T,) as `trajectory` at `times` (T,).
 
-    A lift lasts `gap` to both sides.
+    Args:
+        gesture: phases, slide, twist and lift.
+        times: (T,), 0 to 1 over the gesture.
+        gap: time that a lift lasts to both sides.
+        xp: numpy or jax.numpy.
     """
     ends = xp.cumsum(gesture.phases)
 

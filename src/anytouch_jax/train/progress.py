@@ -41,6 +41,12 @@ def progress(start: int, stop: int, log: Log, *, curve: bool = False) -> Iterato
     """Give a function for the metrics of each step, which shows a bar or logs some twenty lines.
 
     The bar is on a terminal, with a `curve` of the loss above it.
+
+    Args:
+        start: step that the run begins with.
+        stop: step after the last.
+        log: takes a line where there is no terminal.
+        curve: draw the loss above the bar.
     """
     if log is silent or not sys.stderr.isatty():
         every = max(1, (stop - start) // 20)

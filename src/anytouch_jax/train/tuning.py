@@ -26,7 +26,14 @@ SAVE_EVERY = 100
 
 
 def tune_for_steps(config: Config, work: Work, *, rate: float, steps: int) -> FitResult:
-    """Train `work` for `steps` by Adam, from `rate` down to 0 along a cosine. Nothing is stored."""
+    """Train `work` for `steps` by Adam, from `rate` down to 0 along a cosine. Nothing is stored.
+
+    Args:
+        config: with batch size and seed.
+        work: parameters, loss and batches.
+        rate: the first learning rate.
+        steps: of the training.
+    """
     options = FitOptions(mesh=_one_device(), display=_steps_bar)
     return fit_work(_adam(config, rate, steps), work, None, options)
 

@@ -17,7 +17,14 @@ from anytouch_jax.training.start import Params, Start
 def draw_reconstructions(
     step: int, params: Params, batch: TouchBatch | Stage2Batch, *, start: Start
 ) -> None:
-    """Draw the first samples of a batch that has touches to reconstruct."""
+    """Draw the first samples of a batch that has touches to reconstruct.
+
+    Args:
+        step: for the name of the image.
+        params: of the network.
+        batch: whose first samples are drawn.
+        start: of the run, with folder, config and network.
+    """
     touches: Any = batch
     if isinstance(batch, Stage2Batch):
         if batch.align is None or not start.config.reconstructs:

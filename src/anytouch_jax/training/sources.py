@@ -81,7 +81,15 @@ def read_data(config: Config) -> RunData:
 def open_batches(
     config: Config, data: RunData, tokenizer: Tokenizer | None, mesh: Mesh, log: Log
 ) -> BatchSource:
-    """Return the batches of this process."""
+    """Return the batches of this process.
+
+    Args:
+        config: of the run.
+        data: the manifest, or the source of simulated batches.
+        tokenizer: of captions, if there are any.
+        mesh: the devices, whose number decides the slots of a batch.
+        log: takes a sentence on samples that were replaced.
+    """
     kind = data.kind
     if kind is not None:
         return kind(config, data.manifest, tokenizer=tokenizer, devices=mesh.size, log=log)
@@ -92,12 +100,18 @@ def open_batches(
     )
 
 
-def choose_tokenizer(
+def tokenizer_of_run(
     config: Config, data: RunData, clip: PathLike | None, stored: Path | None
 ) -> Tokenizer | None:
     """Return the tokenizer of stage 2, or None.
 
     It is the run's, the option's, CLIP's, or one trained on captions.
+
+    Args:
+        config: of the run.
+        data: the manifest, or the source of simulated batches.
+        clip: CLIP's weights, whose tokenizer pretrained towers need.
+        stored: the tokenizer of a run that is continued.
     """
     if config.model.text is None:
         return None

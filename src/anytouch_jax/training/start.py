@@ -22,9 +22,9 @@ from anytouch_jax.training.sources import TOKENIZER as TOKENIZER
 from anytouch_jax.training.sources import (
     Log,
     RunData,
-    choose_tokenizer,
     open_batches,
     read_data,
+    tokenizer_of_run,
     with_vocabulary,
 )
 from anytouch_jax.weights import checkpoint
@@ -81,7 +81,7 @@ def resolve(
     data = read_data(config)
     # Without a checkpoint a tokenizer is left from a start that failed.
     stored_tokenizer = run / TOKENIZER if resumes and has_tokenizer else None
-    tokenizer = choose_tokenizer(config, data, clip, stored_tokenizer)
+    tokenizer = tokenizer_of_run(config, data, clip, stored_tokenizer)
     config = with_vocabulary(config, tokenizer, data)
     net = build(config.model)
     params = net.init(jax.random.key(config.run.seed))

@@ -199,7 +199,7 @@ class Checkpoints:
         names, shapes or types differ.
         """
         self.wait()
-        folder = resolve(self.folder, step)
+        folder = find_checkpoint(self.folder, step)
         record = checked(folder)
         first = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
         wanted = {
@@ -304,7 +304,7 @@ def read_metadata(folder: str | Path, step: int | None = None) -> dict[str, Any]
 
     Raises CheckpointError.
     """
-    return _description(read_record(resolve(Path(folder), step)))
+    return _description(read_record(find_checkpoint(Path(folder), step)))
 
 
 def load_params(
@@ -316,7 +316,7 @@ def load_params(
     latest meanwhile, the next one is read. Raises CheckpointError.
     """
     for _ in range(_TRIES if step is None else 1):
-        target = resolve(Path(folder), step)
+        target = find_checkpoint(Path(folder), step)
         try:
             record = checked(target)
             parts = ("trainable/", "frozen/", _AVERAGE)
@@ -481,7 +481,7 @@ def is_run(folder: Path) -> bool:
     )
 
 
-def resolve(folder: Path, step: int | None) -> Path:
+def find_checkpoint(folder: Path, step: int | None) -> Path:
     """Return the folder of one checkpoint, from a run, a folder of checkpoints or that folder
     itself.
     """

@@ -124,6 +124,12 @@ def to_params(
     Left out are parts that `model` lacks, buffers, the authors' unused arrays (golden Q2) and the
     keys in `ignore`. Position tables are resized. A probe file gives its classifier as `head`. A
     file may lack those in `optional`. Raises WeightsError.
+
+    Args:
+        weights: arrays of the file by name.
+        model: the network they are for.
+        ignore: keys of the file that are left out.
+        optional: names of ours that a file may lack.
     """
     layout = detect_layout(weights)
     shapes = param_shapes(model)
@@ -301,6 +307,12 @@ def check_activation(path: Path, trained: str | None, config: Config) -> None:
 def check_form(path: Path, before: ModelConfig, config: Config, preset: str = "custom") -> None:
     """Raise UserError with the missing options if weights, of this preset, belong to another
     network than the run's.
+
+    Args:
+        path: of the weights.
+        before: the network that they are of.
+        config: of the run.
+        preset: of the weights, "custom" if nobody knows it.
     """
     pairs = {
         name: tuple(attrgetter(name)(model) for model in (before, config.model)) for name in _FORM
@@ -333,6 +345,12 @@ def _option(name: str, value: Any) -> str:
 def check_clip(path: Path, clip: ModelConfig, config: Config, *, touch: bool) -> None:
     """Raise UserError if CLIP's image tower has another size than the run's image tower or, with
     `touch`, encoder.
+
+    Args:
+        path: of the weights.
+        clip: the network that they are of.
+        config: of the run.
+        touch: also compare with the touch encoder.
     """
     theirs = (clip.touch.width, clip.touch.depth, clip.patch)
     for name, stack in (
@@ -376,6 +394,13 @@ def serve_unseen(
 ) -> Params:
     """Return a touch encoder whose untrained sensors have the universal row (Sec. 3.5), or the mean
     if never drawn.
+
+    Args:
+        touch: parameters of the touch encoder.
+        model: the network.
+        trained: sensors that were trained on.
+        universal_drawn: whether training has drawn the universal row. Otherwise the mean of the
+            trained rows takes its place.
     """
     rows = [row for row, name in enumerate(model.sensors) if name in trained and name != UNIVERSAL]
     unseen = [row for row in range(len(model.sensors)) if row not in rows]

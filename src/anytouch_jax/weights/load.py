@@ -59,9 +59,14 @@ def load_model(
     """Load an encoder by name, a run folder, a checkpoint folder, a weights file or a folder with a
     .pth file.
 
-    `step` chooses a checkpoint, the latest by default. With `stored_rows` the rows for sensors
-    outside the training are unchanged, as a conversion needs them. `weights` are those of the file,
-    if they are read. Raises UserError.
+    Raises UserError.
+
+    Args:
+        path: name of an encoder, a run, a checkpoint, a weights file or its folder.
+        step: of a checkpoint, by default the latest.
+        stored_rows: leave the rows of sensors outside the training unchanged, as a conversion
+            needs them.
+        weights: those of the file, if they are read already.
     """
     path = registry.locate(path)
     if not path.exists():

@@ -38,7 +38,7 @@ from anytouch_jax.weights.tree import flatten
 Params = dict[str, Any]
 
 
-class Start(NamedTuple):
+class InitialParams(NamedTuple):
     """The first parameters of a run, sentences to log, and the sensors that they were trained
     on.
     """
@@ -50,13 +50,17 @@ class Start(NamedTuple):
 
 def load_init(
     fresh: Params, config: Config, *, init: str | Path | None = None, clip: str | Path | None = None
-) -> Start:
+) -> InitialParams:
     """Return the first parameters of a run: `fresh` with parts of `init` and `clip` (golden
     K_weight_loading_map).
 
-    `init`, a run or a weights file, gives the touch encoder and the decoder. `clip`, CLIP weights,
-    gives the towers and, without `init`, the touch encoder. Raises UserError if either does not fit
-    the run.
+    Raises UserError if `init` or `clip` does not fit the run.
+
+    Args:
+        fresh: parameters of the network before training.
+        config: of the run.
+        init: a run or a weights file, which gives the touch encoder and the decoder.
+        clip: CLIP weights, which give the towers and, without `init`, the touch encoder.
     """
     notes: list[str] = []
     trained: tuple[str, ...] = ()
@@ -92,7 +96,9 @@ def load_init(
                 notes.append(
                     f"{file} has no projection: that of the touch encoder starts untrained"
                 )
-    return Start(first_params(fresh, config.model, stage1=stage1, clip=towers), notes, trained)
+    return InitialParams(
+        first_params(fresh, config.model, stage1=stage1, clip=towers), notes, trained
+    )
 
 
 def _check_init(loaded: Loaded, config: Config) -> None:
@@ -184,6 +190,12 @@ def first_params(
     Without `stage1` the touch encoder starts from CLIP's vision tower. The patch kernel is repeated
     over the frames and not divided, as the authors do (golden Q1): the response to a still is three
     times CLIP's. A tower without a projection leaves that of `params`. Raises WeightsError.
+
+    Args:
+        params: fresh ones.
+        model: the network.
+        stage1: parameters of a stage-1 run, for touch encoder and decoder.
+        clip: arrays of CLIP by name, for the towers and the temperature.
     """
     merged = dict(params)
     if clip is not None and stage1 is None:
@@ -231,7 +243,7 @@ def _replace(params: Params, parts: Params) -> Params:
 
 def load_start(
     fresh: Params, config: Config, *, init: str | Path | None = None, clip: str | Path | None = None
-) -> Start:
+) -> InitialParams:
     """Return the first parameters of a run, as `load_init`, where `init` may also be an encoder of
     RGB images.
 
@@ -240,7 +252,9 @@ def load_start(
     """
     model, weights = (None, None) if init is None else open_family(registry.locate(init))
     if model is not None:
-        start = Start(fresh, [], ()) if clip is None else load_init(fresh, config, clip=clip)
+        start = (
+            InitialParams(fresh, [], ()) if clip is None else load_init(fresh, config, clip=clip)
+        )
         adopt = enter(WEIGHTS["image encoder"])
         touch, notes = adopt(model, str(init), config, start.params["touch"])
         return start._replace(params={**start.params, "touch": touch}, notes=[*start.notes, *notes])

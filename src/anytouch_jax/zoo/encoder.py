@@ -319,6 +319,12 @@ class FamilyEncoder(Encoder):
 def pooled(family: Family, form: VitConfig, output: VitOutput, pooling: Pooling) -> jax.Array:
     """Return features (B, E) from the tokens of a family: its own feature, the mean of the patches,
     or both.
+
+    Args:
+        family: the kind of encoder.
+        form: sizes of its network.
+        output: tokens of the network.
+        pooling: "class" for the family's own feature, "mean" or "both".
     """
     patches = output.projected if family.feature == "projected" else output.normed
     mean = jnp.mean(patches[:, form.start :], axis=1)
@@ -340,6 +346,12 @@ def prepare(
 ) -> np.ndarray:
     """Return a frame u8 (h, w, 3) prepared by the steps of a family, f32 (height, width, 3) of
     `size`.
+
+    Args:
+        frame: u8 (h, w, 3).
+        background: the untouched gel u8 (h, w, 3), if there is one.
+        steps: of the family.
+        size: (height, width) of the result.
     """
     if background is not None and background.shape != frame.shape:
         if (

@@ -201,8 +201,15 @@ def read_family(
 ) -> FamilyModel | None:
     """Return the encoder of a file, None for a file of no family.
 
-    `folder` is the config.json: heads, epsilon, changes of the preparation. `image_size` is a side
-    or (height, width). `sensors` are T3's. Raises WeightsError.
+    Raises WeightsError.
+
+    Args:
+        path: of the file.
+        weights: its arrays by name.
+        folder: the config.json beside it: heads, epsilon, changes of the preparation.
+        heads: of attention, if the user names them.
+        image_size: a side or (height, width), if the user names it.
+        sensors: names of T3's.
     """
     if (found := find_family(weights)) is None:
         return None
@@ -305,6 +312,14 @@ def form_of(
 ) -> tuple[VitConfig, Size]:
     """Return the form of the network that made a file, and the size of its images, from the shapes
     of its arrays.
+
+    Args:
+        family: the kind of encoder.
+        weights: arrays of the file by name.
+        folder: the config.json beside it.
+        heads: of attention, if the user names them.
+        image_size: (height, width), if the user names it.
+        sensors: names of T3's.
     """
     rows = {row.name: row for row in family.table}
 

@@ -26,6 +26,12 @@ def touch_of_rgb_images(
     The patch kernel is divided among the frames. Its bias goes into the resized positions, and
     layer scales into the layers before them. Raises UserError for another family, and for a network
     of another form.
+
+    Args:
+        model: a ViT, or a network of another family, which is refused.
+        source: its name for sentences.
+        config: of the run.
+        fresh: parameters of the touch encoder before training.
     """
     if not isinstance(model, FamilyModel):
         raise UserError(f"{source} has convolutions, and a touch encoder starts from a transformer")

@@ -134,6 +134,14 @@ def index(
     `keep` an edited manifest at `out` keeps its columns and values. Raises UserError for a folder
     that is not the dataset and for an option that the reader does not use. It also does so if the
     manifest cannot be written, or if edits would be lost.
+
+    Args:
+        name: the reader.
+        root: the dataset's folder, or for a reader of files one of them.
+        out: the manifest, in `root` or above it. By default ROOT/<name>.parquet, or beside a
+            file one of its name.
+        options: sensor, split and what else the reader uses.
+        keep: keep the columns and values of an edited manifest at `out`.
     """
     if name not in READERS:
         near = difflib.get_close_matches(name.lower().replace("-", "_"), READERS, 1, 0.4)

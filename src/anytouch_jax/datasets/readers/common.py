@@ -273,7 +273,14 @@ class DatasetIndex:
         count: bool = True,
         enter: Callable[[str], bool] = lambda _: True,
     ) -> Iterator[Folder]:
-        """Yield `base` and all folders below it, in order, but those in folders not to `enter`."""
+        """Yield `base` and all folders below it, in order, but those in folders not to `enter`.
+
+        Args:
+            base: a folder below ROOT, with "/" at its end; "" for ROOT itself.
+            inside: the folder below `base` that the walk begins with.
+            count: report what is skipped.
+            enter: says by its name whether a folder is entered.
+        """
         folders, files = self.listing(f"{base}{inside}", count=count)
         yield inside, folders, files
         entered = [folder for folder in folders if enter(folder)]
@@ -337,6 +344,12 @@ class DatasetIndex:
         """Return the files whose whole name matches, by the number in its first group.
 
         Others are skipped.
+
+        Args:
+            folder: below ROOT.
+            pattern: a regular expression of whole names, whose first group is the number.
+            files: names in the folder, by default all.
+            count: report what is skipped.
         """
         files = self.listing(folder)[1] if files is None else files
         match = re.compile(pattern, re.IGNORECASE).fullmatch
@@ -438,6 +451,13 @@ class DatasetIndex:
     ) -> None:
         """Add the frames of a recording; those that a contact list lacks, by `key`/name, get the
         split `unused`.
+
+        Args:
+            frames: names of files by their number.
+            folder: below ROOT, that holds them.
+            split: train, val, test or unused.
+            key: of the recording in the contact list.
+            cells: further columns, a value for all rows or a list of one each.
         """
         cells["split"] = split
         if self.contact is not None:

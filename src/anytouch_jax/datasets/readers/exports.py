@@ -61,6 +61,14 @@ def exported(
 
     `sources` and `which` decide the images, which come to be as a whole when the block ends.
     Raises DatasetError if nothing can be written.
+
+    Args:
+        index: counts what is written, and knows ROOT.
+        folder: below ROOT, for the images.
+        stream: name of the stream in its source.
+        sources: files that the images are read from. If one has changed, they are written
+            again.
+        which: what else decides the images, such as a range of frames.
     """
     place, record = find_export(index.root, folder, stream)
     is_new = record is None or not _is_same(record, sources, which)

@@ -313,6 +313,13 @@ def sideways_kernel(
     Its gradient is that motion. It is (H, W) at offsets >= 0, in units of P / (pi E*). A load pulls
     or pushes along the line to it, so the motion has no curl, and one potential replaces two
     kernels.
+
+    Args:
+        plan: The transform of the grid.
+        pitch: mm between pixels.
+        poisson: Poisson's ratio of the gel.
+        thickness: mm of the gel.
+        dtype: Of the potential.
     """
     table, rest = sideways_table(poisson)
     # Near the load the potential goes as -log r. At 0 this is the mean of log r over a pixel.
@@ -380,7 +387,13 @@ def tangential_spectra(
 ) -> Array:
     """Return the spectra (3, KH, KW) of the tangential coefficients xx, xy, yy.
 
-    Arguments are those of `normal_spectrum`.
+    Args:
+        plan: The transform of the grid.
+        pitch: mm between pixels.
+        poisson: Poisson's ratio of the gel.
+        thickness: mm of the gel; infinite for a half-space.
+        fraction: E* over the gel's plane modulus: the part of the motion that is the layer's.
+        dtype: Of the spectra.
     """
     if is_infinite(thickness):
         return jnp.asarray(_tangential_host(plan, poisson), dtype)

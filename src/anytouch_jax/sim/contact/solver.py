@@ -52,6 +52,13 @@ def conjugate_gradients(
 
     The method is Polonsky and Keer's (Wear 231, 1999). It stops after `iterations`, or if no gap in
     contact and no overlap outside exceeds `tolerance`.
+
+    Args:
+        apply: Gives the motion (H, W) of the surface under pressures (H, W).
+        target: Motion (H, W) that the surfaces ask for where they touch.
+        start: Pressures (H, W) to begin with.
+        tolerance: Largest gap or overlap that is left.
+        iterations: Most of them.
     """
     excess = apply(start) - target
     zero = jnp.zeros((), target.dtype)

@@ -226,6 +226,12 @@ def fit_balls(change: Array, clear: Array, width_mm: float, ball_mm: float) -> C
     """Fit colour changes f32 (N, H, W, 3) of presses of a ball.
 
     Raises UserError if no ball of that size fits.
+
+    Args:
+        change: f32 (N, H, W, 3), colour changes of the presses, 0..1.
+        clear: bool (N, H, W), pixels that count.
+        width_mm: that an image shows.
+        ball_mm: diameter of the ball.
     """
     part = Grid(*(values.ravel() for values in grid_of(change.shape[1:3], width_mm)))
     known = _profiles(ball_mm)

@@ -141,6 +141,14 @@ def felt_batches(
 
     A batch depends on the seed and the step alone. The touches of REUSE steps are the same in
     other light, and the queue has the features of the KEPT touches before them.
+
+    Args:
+        start: first step.
+        stop: step after the last.
+        contrast: the objective, which knows the network.
+        frozen: parameters that do not move.
+        root: key of the seed.
+        touches_of: gives the touches of a step.
     """
     prepare = jax.jit(contrast.prepare)
 

@@ -38,7 +38,13 @@ def own_world(
     """Return the world of your sensor (family 0) and of the `known` ones.
 
     Its objects are those of a split of the usual training, so the encoder of the package has seen
-    no object of split test. All objects are balls of `ball_mm`, if that is given.
+    no object of split test.
+
+    Args:
+        sensor: Folder of your sensor.
+        split: Of the usual training, whose objects are touched.
+        known: Names of sensors of the table.
+        ball_mm: Diameter, if all objects shall be balls.
     """
     scenes = training_scenes(SimulatedConfig())
     things = endless.objects_of(scenes, split, variants=2)[:OBJECTS]

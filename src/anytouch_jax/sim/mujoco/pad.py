@@ -123,6 +123,12 @@ def find_pad(model: mujoco.MjModel, name: str, sensor: Sensor, grid: RayGrid) ->
 
     Raises UserError for a scene without that site, for a site that is no box or has another size
     than the gel, and for one that does not lie on the surface of a geom of its body.
+
+    Args:
+        model: The scene.
+        name: Of the site.
+        sensor: Whose gel must have the site's size.
+        grid: Points of the gel where rays meet the object.
     """
     site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, name)
     if site < 0:

@@ -105,8 +105,14 @@ def pixel_positions(
 ) -> PixelPositions:
     """Return the part of the field in an image of (height, width), zoomed and mirrored.
 
-    It is the largest part of the image's shape. If `stretched`, the whole field fills the image,
-    whose pixels need not be square: what `encoder.preprocess` makes.
+    It is the largest part of the image's shape, unless `stretched`.
+
+    Args:
+        sensor: Kind of sensor.
+        unit: One device of it.
+        resolution: (height, width) in pixels.
+        stretched: The whole field fills the image, whose pixels need not be square: what
+            `encoder.preprocess` makes.
     """
     height, width = resolution
     tall = sensor.field[0] / height
@@ -131,6 +137,12 @@ def backdrop(
     """Return the untouched image of a unit without markers and noise, f32 (3, H, W) in 0..1.
 
     Pass it to `render` as `behind` if many frames of one unit are rendered outside of one `vmap`.
+
+    Args:
+        sensor: Kind of sensor.
+        unit: One device of it.
+        resolution: (height, width) in pixels, by default the sensor's own.
+        stretched: As in `pixel_positions`.
     """
     resolution = resolution or image_size(sensor)
     place = pixel_positions(sensor, unit, resolution, stretched=stretched)
@@ -322,8 +334,12 @@ def colour_change(normal: Array, nx: Array, ny: Array, u: Array, v: Array) -> Ar
 def halo_change(halo: Array, features: tuple[Array, ...], u: Array, v: Array) -> Array:
     """Return the change (H, W) of one channel by the blurred dent.
 
-    `features` are its slope x, slope y and depth, each (H, W). `halo` (3, 3) is that channel of
-    `Photometry.halo`: a constant and a drift along u and v for each.
+    Args:
+        halo: (3, 3), one channel of `Photometry.halo`: a constant and a drift along u and v for
+            each feature.
+        features: Slope along x, slope along y and depth of the blurred dent, each (H, W).
+        u: (W,) places along x, -1 to 1 over the image.
+        v: (H,) places along y.
     """
     terms = [
         feature * (halo[k, 0] + u[None, :] * halo[k, 1] + v[:, None] * halo[k, 2])

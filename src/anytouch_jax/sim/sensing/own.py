@@ -166,7 +166,14 @@ def _fault(file: Path, _: int) -> str:
 def write_sensor(
     folder: str | Path, numbers: OwnSensor, bases: npt.ArrayLike, look: Photometry
 ) -> Path:
-    """Write a folder NAME.sensor, with untouched gels u8 (n, h, w, 3), and return it."""
+    """Write a folder NAME.sensor, with untouched gels u8 (n, h, w, 3), and return it.
+
+    Args:
+        folder: NAME.sensor.
+        numbers: what sensor.json holds.
+        bases: untouched gels u8 (n, h, w, 3).
+        look: colours by slope and depth.
+    """
     path = Path(folder)
     data = io.BytesIO()
     arrays = {name: np.asarray(value, np.float32) for name, value in look._asdict().items()}

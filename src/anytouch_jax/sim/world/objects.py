@@ -323,7 +323,14 @@ def catalogue(seed: int, count: int = 64) -> tuple[Object, ...]:
 
 
 def draw_object(primitive: str, texture: str, material: str, seed: int) -> Object:
-    """Return an object of this kind, its sizes, phases and colour drawn from `seed`."""
+    """Return an object of this kind, its sizes, phases and colour drawn from `seed`.
+
+    Args:
+        primitive: name of the shape.
+        texture: name of the texture.
+        material: name of the material.
+        seed: of sizes, phases and colour.
+    """
     rng = np.random.default_rng([seed, 11])
     made_of = MATERIALS[material]
     kind = TEXTURE_KINDS[texture]

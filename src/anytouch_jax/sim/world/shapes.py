@@ -38,9 +38,16 @@ def gaussian_field(
 ) -> Array:
     """Return a random field of mean 0 and standard deviation 1.
 
-    Its autocorrelation is exp(-(du / l_u)^2 - (dv / l_v)^2). `u`, `v` and `length` are in mm. The
-    field is a sum of cosines. The radii of their wave vectors are quantiles, so few terms follow
-    the spectrum, and no wave is shorter than 1.6 lengths. An open grid costs one matrix product.
+    Its autocorrelation is exp(-(du / l_u)^2 - (dv / l_v)^2). The field is a sum of
+    cosines. The radii of their wave vectors are quantiles, so few terms follow the spectrum, and no
+    wave is shorter than 1.6 lengths. An open grid costs one matrix product.
+
+    Args:
+        u: places along x, mm.
+        v: places along y, mm, of the shape of `u`, or (H, 1) beside `u` (W,).
+        length: correlation lengths (l_u, l_v), mm.
+        seed: of the phases.
+        terms: cosines in the sum.
     """
     rng = np.random.default_rng([seed, terms])
     radius = np.sqrt(-2 * np.log1p(-(np.arange(terms) + 0.5) / terms))
@@ -74,6 +81,13 @@ def warp(u: Array, v: Array, pitch: float, amount: float, seed: int) -> tuple[Ar
     """Displace the places by `amount` pitches (RMS) over some five pitches.
 
     No real pattern is quite regular.
+
+    Args:
+        u: places along x, mm.
+        v: places along y, mm.
+        pitch: of the pattern, mm.
+        amount: RMS of the displacement, in pitches.
+        seed: of the displacement.
     """
     if amount == 0:
         return u, v

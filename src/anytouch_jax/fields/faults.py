@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import cv2
 import numpy as np
 
@@ -98,13 +100,18 @@ def _unlike(frame: Array, background: Array) -> str:
         change = other - gel
         return float(np.median(np.abs(change - np.median(change, axis=(0, 1))).max(2)))
 
-    others = {
-        "mirrored left to right": differs(own[:, ::-1]),
-        "mirrored top to bottom": differs(own[::-1]),
-        "upside down": differs(own[::-1, ::-1]),
-        "as with red and blue exchanged": differs(own[..., ::-1]),
+    ways: dict[str, Callable[[Array], Array]] = {
+        "mirrored left to right": lambda image: image[:, ::-1],
+        "mirrored top to bottom": lambda image: image[::-1],
+        "upside down": lambda image: image[::-1, ::-1],
+        "as with red and blue exchanged": lambda image: image[..., ::-1],
     }
+    others = {name: differs(way(own)) for name, way in ways.items()}
     nearest = min(others, key=lambda name: others[name])
-    if _FACTOR * others[nearest] + _LEVEL < differs(own):
+    least = others[nearest]
+    # A gel that looks nearly alike when turned cannot tell: drift of the light may undo what a turn
+    # would change, so a turn must change more than it leaves.
+    told = differs(ways[nearest](gel))
+    if _FACTOR * least + _LEVEL < differs(own) and least + _LEVEL < told:
         return nearest
     return ""

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import cv2
 import jax
 import numpy as np
 
@@ -21,8 +22,9 @@ from anytouch_jax.sim.sensing.own import OwnSensor, write_sensor
 from anytouch_jax.sim.sensing.sensors import SENSORS, bases, look
 from anytouch_jax.sim.world.objects import PRIMITIVE_KINDS
 
+BODY = "gelsight"  # the sensor of the table whose gel and camera the new one has
 COUNT = 32  # touches that are simulated at once
-SIZE = 112  # pixels of a side
+SIZE = 112  # pixels of a side, of the whole gel: its images are stretched to squares
 OBJECTS = 160  # of a split, at most
 LEAST = 0.3  # mm; a shallower touch shows little of a shape
 AMBER = (1.0, 0.62, 0.18)
@@ -42,9 +44,16 @@ class Touches(NamedTuple):
     force: np.ndarray  # (n,) N into the gel
 
 
+def unstretched(image: np.ndarray) -> np.ndarray:
+    """Return an image of the simulated sensor in the proportions of its gel."""
+    height, width = SENSORS[BODY].field
+    size = (SIZE, round(SIZE * height / width))
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+
+
 def write_ring_light(folder: Path) -> Path:
     """Write the sensor as a folder NAME.sensor, and return it."""
-    body = SENSORS["gelsight"]
+    body = SENSORS[BODY]
     photometry = look(body)
     normal = np.zeros_like(np.asarray(photometry.normal))
     # The powers of the normal are 1, 1, then 2, 2, 2: those of x^2 and y^2 make a glow.

@@ -12,6 +12,7 @@ from typing import Literal, get_args, get_origin, get_type_hints
 import numpy as np
 import pytest
 
+from anytouch_jax import __main__ as program
 from anytouch_jax.cli import arguments
 from anytouch_jax.cli.app import COMMANDS, GROUPS, guarded, main
 from anytouch_jax.cli.arguments import options_of
@@ -245,6 +246,18 @@ def test_ctrl_c_during_an_import_is_no_bug(capsys):
             raise RuntimeError("Error calling __set_name__ on 'Field' instance") from stop
 
     assert guarded("anytouch embed", run) == 130
+    assert capsys.readouterr().err == "interrupted\n"
+
+
+def test_ctrl_c_while_the_command_itself_is_imported_is_no_bug(capsys, monkeypatch):
+    class Stopped:
+        def find_spec(self, name, *_):
+            if name == "anytouch_jax.cli.app":
+                raise KeyboardInterrupt
+
+    monkeypatch.delitem(sys.modules, "anytouch_jax.cli.app")
+    monkeypatch.setattr(sys, "meta_path", [Stopped(), *sys.meta_path])
+    assert program.run_command() == 130
     assert capsys.readouterr().err == "interrupted\n"
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -22,6 +23,7 @@ from experiments.demo.report import (
     sentences,
     write_findings,
 )
+from experiments.demo.run import measured_force
 from experiments.demo.touches import NAMES, Touches, write_ring_light
 from experiments.demo.training import (
     POINTS,
@@ -146,3 +148,37 @@ def test_a_page_has_no_section_without_something_to_say(tmp_path: Path) -> None:
         assert not re.search(r'(src|href)="(?!data:)', html)
     assert titles["good"][:-1] == titles["bad"]
     assert COMMONEST not in page.read_text().split("\n\n")[0]
+
+
+class Seeing:
+    """An encoder that keeps the shapes of what it measures, and says what it does not know."""
+
+    def __init__(self) -> None:
+        self.shapes: set[tuple[int, ...]] = set()
+
+    def measure(self, frame: Any, background: Any, sensor: str, log: Any) -> Any:
+        self.shapes |= {frame.shape, background.shape}
+        log(f"sensor {sensor!r} has no tokens of its own here")
+        log("it looks odd")
+        return SimpleNamespace(force=np.ones((1, 3)))
+
+
+def test_force_is_measured_in_the_proportions_of_the_gel(tmp_path: Path, capsys: Any) -> None:
+    """Simulated images are stretched to squares. What nobody can act on is not said."""
+    folder = write_ring_light(tmp_path / "ring_light.sensor")
+    height, width = read_sensor(folder).field
+    encoder = Seeing()
+    measured_force(encoder, folder, touches(3))  # type: ignore[arg-type]
+    assert [one[0] / one[1] for one in encoder.shapes] == [pytest.approx(height / width)]
+    told = capsys.readouterr().out
+    assert told.count("it looks odd") == 3 and "tokens" not in told
+
+
+def test_the_section_on_force_says_where_it_fails(tmp_path: Path) -> None:
+    found = findings({HEAD: 0.7, PACKAGE: 0.9, NOTHING: 0.3}, 0.0)
+    weak = found.test.force < 1.2
+    found.test.force[weak] /= 10
+    found.force[:] = np.where(weak, 0.0, found.test.force)
+    text = write_findings(found, tmp_path, 1.0).read_text()
+    assert f"{100 * np.mean(~weak):.0f} % of {len(weak)} touches are read within half" in text
+    assert f"Of the {weak.sum()} touches below 0.5 N it is 0 %." in text

@@ -294,6 +294,18 @@ def test_a_wide_press_is_not_called_recoloured():
     assert alarms <= 5
 
 
+def test_drift_of_the_light_on_a_symmetric_gel_is_no_turn():
+    """A mirror image of such a gel changes less than the light of a correct device drifts."""
+    ramp = np.linspace(-1, 1, 160)[None, :, None]
+    dome = 60 - 20 * (ramp**2 + np.linspace(-1, 1, 120)[:, None, None] ** 2)
+    gel = np.clip((dome + 2 * ramp) * (1, 0.62, 0.18), 0, 255).astype(np.uint8)
+    drifted = np.clip((dome - 8 * ramp) * (1, 0.62, 0.18), 0, 255).astype(np.uint8)
+    assert not fields.faults_of(drifted, gel, "ring_light", 0.75)
+    real, _ = faulty("none")
+    for turned in (real[:, ::-1], real[::-1], real[::-1, ::-1], real[..., ::-1]):
+        assert fields.faults_of(np.ascontiguousarray(turned), real, "gelsight_mini", 0.75)
+
+
 def test_the_part_is_kept_in_the_package_and_its_calibration_too(tmp_path):
     source = measuring_weights(
         tmp_path / "w.safetensors", {"depth": 1.5, "modulus": {"digit": 90.0}}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import cv2
 import numpy as np
 
@@ -82,6 +84,9 @@ def faults_of(
     return tuple(faults)
 
 
+EXCHANGED = "as with red and blue exchanged"
+
+
 def _unlike(frame: Array, background: Array) -> str:
     """Return how a frame was turned or recoloured against its background, "" if it was not."""
     size = (_SIDE, max(1, round(_SIDE * frame.shape[0] / frame.shape[1])))
@@ -98,13 +103,20 @@ def _unlike(frame: Array, background: Array) -> str:
         change = other - gel
         return float(np.median(np.abs(change - np.median(change, axis=(0, 1))).max(2)))
 
-    others = {
-        "mirrored left to right": differs(own[:, ::-1]),
-        "mirrored top to bottom": differs(own[::-1]),
-        "upside down": differs(own[::-1, ::-1]),
-        "as with red and blue exchanged": differs(own[..., ::-1]),
+    ways: dict[str, Callable[[Array], Array]] = {
+        "mirrored left to right": lambda image: image[:, ::-1],
+        "mirrored top to bottom": lambda image: image[::-1],
+        "upside down": lambda image: image[::-1, ::-1],
+        EXCHANGED: lambda image: image[..., ::-1],
     }
+    others = {name: differs(way(own)) for name, way in ways.items()}
     nearest = min(others, key=lambda name: others[name])
-    if _FACTOR * others[nearest] + _LEVEL < differs(own):
+    least = others[nearest]
+    # A gel that looks nearly alike in the mirror cannot tell: drift of the light may undo what the
+    # mirror would change, so it must change more than it leaves. Exchanged colours leave much, but
+    # drift hardly undoes them.
+    is_mirrored = nearest != EXCHANGED
+    told = not is_mirrored or least + _LEVEL < differs(ways[nearest](gel))
+    if told and _FACTOR * least + _LEVEL < differs(own):
         return nearest
     return ""

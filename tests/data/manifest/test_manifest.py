@@ -451,6 +451,12 @@ def test_text_of_a_parquet_that_is_not_utf8_is_named(tmp_path, name):
     )
 
 
+def test_a_name_that_is_not_utf8_makes_no_manifest_and_is_named(tmp_path):
+    cells = columns(2, object=["mug", os.fsdecode(b"mug\xff")])
+    told = refused(r"the name 'mug\\udcff' is not UTF-8", m.from_columns, cells, tmp_path / "m.csv")
+    assert "codec" not in str(told)
+
+
 @pytest.mark.parametrize(
     "kind", [pa.large_string(), pa.string_view(), pa.dictionary(pa.int8(), pa.large_string())]
 )

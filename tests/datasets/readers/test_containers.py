@@ -1,5 +1,6 @@
 """HDF5 and zarr become manifests: cameras, recordings, labels and splits of the usual layouts."""
 
+import os
 from collections import Counter
 
 import cv2
@@ -100,6 +101,13 @@ def test_a_file_of_robomimic(robomimic):
     assert len({(row["object"], row["split"]) for row in table.rows.values()}) == 6
     notes = " ".join(table.report.notes)
     assert "env_args" in notes and "actions" in notes and "next_obs" not in notes
+
+
+def test_a_file_whose_name_is_not_utf8_is_one_sentence(robomimic):
+    named = robomimic.with_name(os.fsdecode(b"demo\xff.hdf5"))
+    robomimic.rename(named)
+    options = IndexOptions(sensor="digit", keys=("obs/tactile_left",))
+    refused(r"the name 'demo\\udcff.hdf5' is not UTF-8", index, "hdf5", named, options=options)
 
 
 def test_keys_choose_cameras_and_values_make_labels(robomimic):

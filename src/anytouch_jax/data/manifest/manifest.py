@@ -292,6 +292,11 @@ def from_columns(columns: Mapping[str, Any], path: str | Path) -> Manifest:
     file = Path(path).expanduser().resolve()
     try:
         table = pa.table({name: pa.array(values) for name, values in columns.items()})
+    except UnicodeEncodeError as error:
+        raise ManifestError(
+            f"{file}: the name {error.object!r} is not UTF-8, and a manifest holds no other text; "
+            "rename this file or folder"
+        ) from None
     except (pa.ArrowException, ValueError, OverflowError) as error:
         raise ManifestError(f"{file}: the columns make no table: {error}") from None
     return _join([schema.typed(table, file)], (file,))

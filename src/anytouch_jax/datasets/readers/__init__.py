@@ -154,6 +154,11 @@ def index(
     if base.name.lower().endswith(reader.files) and base.exists():
         file = base.name
         base = base.parent
+        if file.encode(errors="ignore").decode() != file:
+            raise UserError(
+                f"the name {file!r} is not UTF-8, and a manifest holds no other text; rename this "
+                "file"
+            )
     if not base.is_dir():
         problem = f"{base} is a file" if base.exists() else f"there is no folder {base}"
         endings = f", or a file {', '.join(reader.files)}" if reader.files else ""

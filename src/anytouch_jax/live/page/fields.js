@@ -92,7 +92,9 @@ function drawSurface(canvas) {
 }
 
 // A bar along the plate's front edge, and one of a whole scale on its corner, in mm.
-function drawScale(g, { width, height, whole, unit, wideMm }, place) {
+function drawScale(g, { width, height, whole, unit, wideMm, shownWide }, place) {
+  // Letters are 13 px high on the screen, however small the view is shown.
+  const size = Math.max(15, Math.round((13 * VIEW[0]) / (shownWide || VIEW[0])));
   const side = height / width / 2, along = wideMm ? 5 / wideMm : 0.25, corner = [-0.5, side], style = getComputedStyle(document.body);
   const bar = (from, to, text, shift) => {
     const [a, b] = [place(...from), place(...to)];
@@ -102,14 +104,14 @@ function drawScale(g, { width, height, whole, unit, wideMm }, place) {
     g.moveTo(a[0], a[1]);
     g.lineTo(b[0], b[1]);
     g.stroke();
-    g.font = "15px system-ui, sans-serif";
-    const u = Math.min(VIEW[0] - 62, Math.max(6, (a[0] + b[0]) / 2 + shift[0])), v = Math.min(VIEW[1] - 6, Math.max(18, (a[1] + b[1]) / 2 + shift[1]));
+    g.font = `${size}px system-ui, sans-serif`;
+    const u = Math.min(VIEW[0] - 4 * size, Math.max(6, (a[0] + b[0]) / 2 + shift[0])), v = Math.min(VIEW[1] - 6, Math.max(size + 3, (a[1] + b[1]) / 2 + shift[1]));
     g.lineWidth = 4;
     g.strokeStyle = style.backgroundColor;
     g.strokeText(text, u, v);
     g.fillText(text, u, v);
   };
-  if (wideMm) bar([...corner, 0], [corner[0] + along, corner[1], 0], "5 mm", [-14, 22]);
+  if (wideMm) bar([...corner, 0], [corner[0] + along, corner[1], 0], "5 mm", [-14, size + 7]);
   bar([...corner, 0], [...corner, LIFT], `${unit === "mm" ? whole : whole.toFixed(3)} ${unit}`, [8, -4]);
 }
 
@@ -128,7 +130,8 @@ function showLayer(canvas, bitmap, measured) {
     // The scale grows, and stays: a press that comes and goes would otherwise look equally high all the time.
     canvas.whole = canvas.unit === unit ? Math.max(canvas.whole, enough) : enough;
     canvas.unit = unit;
-    canvas.surface = { ...heightsOf(bitmap, scale, canvas.whole), whole: canvas.whole, unit, wideMm: unit === "mm" ? scale / high : null };
+    if (!canvas.wasSurface) canvas.shownWide = canvas.clientWidth; // once, since it may lay the page out
+    canvas.surface = { shownWide: canvas.shownWide, ...heightsOf(bitmap, scale, canvas.whole), whole: canvas.whole, unit, wideMm: unit === "mm" ? scale / high : null };
     drawSurface(canvas);
   } else {
     canvas.surface = null;
@@ -159,11 +162,11 @@ const stage = (canvas) => {
 
 // Force as a bar, and depth and area in words. `show` takes what was measured of a frame, or nothing.
 function forceBar() {
-  const bar = el("i", { className: "ours" }), value = el("span"), words = el("p", { className: "soft small" }), doubt = el("p", { className: "soft small" }), fault = el("p", { className: "soft small" });
+  const bar = el("i", { className: "ours" }), value = el("span"), words = el("p", { className: "soft small" }), doubt = el("p", { className: "soft small" }), fault = el("p", { className: "alarm small" });
   const bars = el("div", { className: "bars small" }, el("span", {}, "force"), el("span", { className: "track" }, bar), value);
   const ramp = el("canvas", { width: 120, height: 10, role: "img", ariaLabel: "colours from no depth to the deepest" }), deepest = el("span");
   const scale = el("p", { className: "scale small" }, el("span", {}, "depth 0"), ramp, deepest);
-  const node = el("div", { className: "force" }, bars, words, doubt, scale, fault);
+  const node = el("div", { className: "force" }, fault, bars, words, doubt, scale);
   const g = ramp.getContext("2d"), colours = g.createLinearGradient(0, 0, 120, 0);
   INFERNO.forEach((colour, i) => colours.addColorStop(i / (INFERNO.length - 1), colour));
   g.fillStyle = colours;
@@ -188,8 +191,9 @@ function forceBar() {
     part.push(`depth ${off(one.depth, one.depth_std, one.unit === "mm" ? 2 : 4)} ${one.unit}`);
     part.push(one.unit === "mm" ? `contact ${one.area.toFixed(0)} mm²` : "no mm and N, since the sensor is not known");
     words.textContent = part.join(", ");
-    doubt.textContent = note || (one.calibrated || one.unit !== "mm" ? "" : `Of ${one.case}: mm and N are a first guess until a ball and a weight calibrate it.`);
-    fault.textContent = one.faults.length ? `Do not trust these values: ${one.faults.join(" ")}` : "";
+    const isFaulty = one.faults.length > 0; // then it is no guess
+    doubt.textContent = note || (isFaulty ? "" : (one.calibrated || one.unit !== "mm" ? "" : `Of ${one.case}: mm and N are a first guess until a ball and a weight calibrate it.`));
+    fault.textContent = isFaulty ? `Do not trust these values: ${one.faults.join(" ")}` : "";
   };
   show(null);
   return { node, show };

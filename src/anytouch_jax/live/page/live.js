@@ -31,7 +31,7 @@ function showLive(source, about) {
   const felt = el("h2", { className: "felt" }), sure = el("div", { className: "bars small" }), why = el("p", { className: "soft" });
   const facts = el("div", { className: "facts" }), near = el("div", { className: "thumbs" }), nearest = el("div", { className: "thumbs" });
   const force = forceBar(), images = about.table === null ? null : framesOf(about.table, "frame", true);
-  const ages = [], parts = [], scores = {}, boxes = {}, view = { rotate: 0, flip: "none" };
+  const ages = [], parts = [], scores = {}, rows = {}, boxes = {}, view = { rotate: 0, flip: "none" };
   let drawnAt = 0, toldAt = 0, stopped = new AbortController(), shownNear = "", done = null, recording = false, asked = "", pressed = 0, taught = -1, learning = false, listed = "", trained = false, orders = Promise.resolve();
   let recorded = new Images(`${source}/recorded`, "frame", true);
   const fact = (name, value, kind = "") => {
@@ -130,15 +130,14 @@ function showLive(source, about) {
   const curve = (name, value, level) => {
     if (!scores[name]) {
       scores[name] = [];
-      curves.append(el("span", { className: "soft" }, name), el("canvas", { className: "chart", role: "img", ariaLabel: `${name} over time` }), el("span"));
+      rows[name] = curveRow(name);
+      curves.append(...rows[name].parts);
     }
     scores[name].push(value);
     if (scores[name].length > KEPT_LIVE) scores[name].shift();
     return () => {
-      const at = 3 * Object.keys(scores).indexOf(name);
-      const unit = unitOf(name);
-      chart(curves.children[at + 1], [{ values: scores[name], colour: accent() }], { level, reach: REACH[name], length: KEPT_LIVE, unit });
-      curves.children[at + 2].textContent = shortened(value, unit);
+      rows[name].draw([{ values: scores[name], colour: accent() }], { level, reach: REACH[name], length: KEPT_LIVE });
+      rows[name].now.textContent = shortened(value, unitOf(name));
     };
   };
   // What is not known of a frame, such as slip where nothing touches, is a gap in its curve.

@@ -153,18 +153,19 @@ const unitOf = (name) => name.split(", ")[1] ?? "";
 const within = (value) => value !== null && value !== undefined;
 
 // lines: [{values: [y or null], x: [x] or nothing, colour, dash, faint}]; mark: x of a vertical line; level: y of a limit;
-// reach: values that the axis shows at least; unit: of y. Where a value is null, the line has a gap.
-// With a `length` in frames the chart has the time axis of a slider, and its numbers lie inside.
-function chart(canvas, lines, { mark = null, level = null, reach = [], log = false, length = 0, unit = "" } = {}) {
+// reach: values that the axis shows at least. Where a value is null, the line has a gap.
+// With a `length` in frames the chart has the time axis of a slider. Its numbers would lie on the curve, so they are
+// returned as text, to stand beside it.
+function chart(canvas, lines, { mark = null, level = null, reach = [], log = false, length = 0 } = {}) {
   const ratio = window.devicePixelRatio || 1, width = canvas.clientWidth, height = canvas.clientHeight;
-  if (!width) return;
+  if (!width) return "";
   canvas.width = width * ratio;
   canvas.height = height * ratio;
   const g = canvas.getContext("2d"), style = getComputedStyle(document.body);
   g.scale(ratio, ratio);
   const y = (value) => (log ? Math.log10(Math.max(value, 1e-9)) : value);
   const every = lines.flatMap((line) => line.values.filter(within).map(y));
-  if (!every.length) return;
+  if (!every.length) return "";
   every.push(...(level === null ? reach : [...reach, level]).map(y));
   let low = every.reduce((a, b) => Math.min(a, b)), high = every.reduce((a, b) => Math.max(a, b));
   if (high - low < 1e-9) { low -= 0.5; high += 0.5; }
@@ -177,8 +178,8 @@ function chart(canvas, lines, { mark = null, level = null, reach = [], log = fal
   const py = (value) => 5 + (height - 5 - foot) * (1 - (value - low + room) / (high - low + 2 * room));
   const decimals = decimalsOf(high - low);
   const text = (value) => {
-    const number = log ? 10 ** value : value, shown = log ? Number(number.toPrecision(2)).toString() : number.toFixed(decimals);
-    return unit ? `${shown} ${unit}` : shown;
+    const number = log ? 10 ** value : value;
+    return log ? Number(number.toPrecision(2)).toString() : number.toFixed(decimals);
   };
   g.strokeStyle = style.getPropertyValue("--line");
   g.strokeRect(inset, 5, width - inset - 8, height - 5 - foot);
@@ -208,18 +209,21 @@ function chart(canvas, lines, { mark = null, level = null, reach = [], log = fal
   if (mark !== null) stroke(style.getPropertyValue("--text"), [[px(mark), 5], [px(mark), height - foot]]);
   g.font = "12px system-ui, sans-serif";
   g.fillStyle = style.getPropertyValue("--soft");
-  g.textAlign = length ? "left" : "right";
+  if (length) return `${text(low)} to ${text(high)}`;
+  g.textAlign = "right";
   g.textBaseline = "middle";
-  g.strokeStyle = style.backgroundColor;
-  g.lineWidth = 4;
-  for (const draw of ["strokeText", "fillText"]) { // numbers can be read on top of a line
-    g[draw](text(high), length ? 12 : 48, Math.max(12, py(high)));
-    g[draw](text(low), length ? 12 : 48, Math.min(height - foot - 7, py(low)));
-  }
-  if (!length) {
-    g.textBaseline = "alphabetic";
-    g.fillText(String(right), width - 8, height - 2);
-  }
+  g.fillText(text(high), 48, Math.max(12, py(high)));
+  g.fillText(text(low), 48, Math.min(height - foot - 7, py(low)));
+  g.textBaseline = "alphabetic";
+  g.fillText(String(right), width - 8, height - 2);
+  return "";
+}
+
+// A row of a time axis: what it shows and its reach, its curve, and its value now.
+function curveRow(name) {
+  const canvas = el("canvas", { className: "chart", role: "img", ariaLabel: `${name} over time` }), reach = el("span", { className: "small" }), now = el("span");
+  const draw = (lines, options) => { reach.textContent = chart(canvas, lines, options); };
+  return { canvas, now, draw, parts: [el("span", { className: "soft" }, name.replaceAll("_", " "), reach), canvas, now] };
 }
 
 function swatch(colour, dash) {
@@ -301,18 +305,17 @@ function timeline(cards, length, seek) {
   const node = el("section", {}, el("div", { className: "time scrub" }, playing, slider, clock), seen, labels);
   const names = new Set(cards.flatMap((one) => Object.keys(one.clip.curves))), rows = [], added = new Set();
   const addRow = (curves, name, of, level, reach) => {
-    const canvas = el("canvas", { className: "chart", role: "img", ariaLabel: `${name} over time` }), now = el("span");
+    const { canvas, now, parts, draw: drawCurve } = curveRow(name);
     const point = (event) => { if (event.buttons) seek(Math.round(((event.offsetX - 8) / (canvas.clientWidth - 16)) * (length - 1))); };
     canvas.addEventListener("pointerdown", point);
     canvas.addEventListener("pointermove", point);
     const unit = unitOf(name);
-    const parts = [el("span", { className: "soft" }, name.replaceAll("_", " ")), canvas, now];
     curves.append(...parts);
     rows.push((t) => {
       const lines = cards.map((one, i) => ({ values: of(one), ...looks(i) }));
       parts.forEach((part) => { part.hidden = lines.every((line) => line.values.every((each) => each === null)); });
       if (parts[0].hidden) return;
-      chart(canvas, lines, { mark: t, level, reach, length, unit });
+      drawCurve(lines, { mark: t, level, reach, length });
       now.textContent = lines.map((line) => shortened(line.values[Math.min(t, line.values.length - 1)], unit)).join("\n");
     });
   };

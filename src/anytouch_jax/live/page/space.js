@@ -138,9 +138,10 @@ function showRun(source) {
   const figureLabel = el("label", { hidden: true }, "figure: reconstructions, masks and predicted frames", pick);
   // Of stills the loss is the reconstruction, and one line is enough.
   const isAgain = (term) => term === "reconstruction" && lines.every((line) => !(term in line) || Math.abs(line[term] - line.loss) < 1e-9 * Math.abs(line.loss));
-  // A mean that forgets: over a fiftieth of the steps, so that what moves can be seen through the noise.
+  // A mean that forgets: over a fiftieth of the steps, or a few, so that what moves can be seen through the noise.
+  const shortNumber = (value) => (value && Math.abs(value) < 1e-3 ? value.toExponential(1) : Number(value.toPrecision(5)).toString());
   const smooth = (values) => {
-    const keep = Math.exp(-50 / Math.max(values.length, 50));
+    const keep = Math.exp(-50 / Math.max(values.length, 250));
     let mean = values[0];
     return values.map((value) => (mean = keep * mean + (1 - keep) * value));
   };
@@ -152,11 +153,11 @@ function showRun(source) {
     });
     const untrained = lines[0]?.[terms[0]] ?? null;
     chart(canvas, curves, { log, level: untrained });
-    names.replaceChildren(...legend(terms, true), ...(untrained === null ? [] : [el("span", {}, swatch(getComputedStyle(document.body).getPropertyValue("--soft"), [4, 4]),
+    names.replaceChildren(...legend(terms.map((term) => term.replace("_", " ")), true), ...(untrained === null ? [] : [el("span", {}, swatch(getComputedStyle(document.body).getPropertyValue("--soft"), [4, 4]),
       `baseline: ${terms[0]} at the first step, ${Number(untrained.toPrecision(3))}`)]), el("span", {}, "faint: every step, firm: smoothed"));
     const last = lines[lines.length - 1] ?? {};
     facts.replaceChildren(...["step", ...TERMS, "seconds", "learning_rate"].filter((name) => name in last).map((name) =>
-      el("div", { className: "fact" }, name.replace("_", " "), el("b", {}, Number(last[name].toPrecision(5)).toString()))));
+      el("div", { className: "fact" }, name.replace("_", " "), el("b", {}, shortNumber(last[name])))));
   };
   const figure = guard(async (name) => {
     shown = name;

@@ -131,6 +131,21 @@ def calibrate(folder: Path) -> None:
     )
 
 
+def scale(folder: Path, factor: float) -> None:
+    """Multiply the depth that an encoder reads, and write it again with its card.
+
+    All else that it reads stays, because the layer that takes depth divides by the factor.
+    """
+    loaded = load_model(folder)
+    fields = jax.tree.map(lambda value: np.array(value), loaded.params["fields"])
+    for name, outputs in (("slope", slice(0, 2)), ("maps", slice(0, 1))):
+        fields[name]["kernel"][:, outputs] *= factor
+        fields[name]["bias"][outputs] *= factor
+    fields["press"]["up"]["kernel"][-1] /= factor
+    params = loaded.params | {"fields": fields}
+    rewrite(folder, folder, dataclasses.replace(loaded, params=params))
+
+
 def deepened(key: jax.Array, drawn: endless.DrawnTouches) -> endless.DrawnTouches:
     """Return touches of which a part is pressed deeper, up to three quarters of the gel.
 
@@ -485,6 +500,9 @@ def main() -> None:
     )
     first = commands.add_parser("calibrate", help="scale the deviations of an encoder's folder")
     first.add_argument("model", type=Path)
+    third = commands.add_parser("scale", help="multiply the depth that an encoder's folder reads")
+    third.add_argument("model", type=Path)
+    third.add_argument("factor", type=float)
     second = commands.add_parser(
         "test", help="measure errors on objects that training never touched"
     )
@@ -496,6 +514,8 @@ def main() -> None:
         train(str(given.model), given.minutes, given.out)
     elif given.command == "calibrate":
         calibrate(given.model)
+    elif given.command == "scale":
+        scale(given.model, given.factor)
     else:
         test(given.model, given.out)
 

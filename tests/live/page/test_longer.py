@@ -10,6 +10,7 @@ from anytouch_jax.encoder.encoder import load_encoder
 from anytouch_jax.encoder.linear_head import HEAD
 from anytouch_jax.errors import UserError
 from anytouch_jax.live.page import longer
+from anytouch_jax.live.page.fitting import false_alarms_of
 from anytouch_jax.live.page.teach import LiveRecorder, Teacher
 
 PRESSED = 50.0  # a contact score
@@ -66,6 +67,11 @@ def test_the_page_names_by_what_was_trained_longer(teacher):
     assert again.tuned is None
     teacher.longer.forget()
     assert not teacher.about()["longer"]["used"]
+
+
+def test_nine_recordings_tell_what_is_new_after_both_trainings():
+    # What training longer leaves is calibrated as the head before it was.
+    assert [false_alarms_of(count) for count in (8, 9, 12, 40)] == [0.05, 0.1, 0.08, 0.05]
 
 
 def test_it_can_be_stopped_and_needs_two_names(teacher):

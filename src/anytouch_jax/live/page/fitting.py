@@ -14,12 +14,15 @@ import numpy as np
 
 from anytouch_jax.data.background.contact import DEFAULT_THRESHOLD, THRESHOLDS
 from anytouch_jax.data.background.rule import Backgrounds
+from anytouch_jax.data.manifest import manifest as manifests
 from anytouch_jax.encoder.arrays import Array, Pooling
 from anytouch_jax.encoder.linear_head import COVERAGE, FALSE_ALARMS, LinearHead
 from anytouch_jax.evaluate import heads, probing, splits
 from anytouch_jax.live.page.recorder import SCORE
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from anytouch_jax.data.manifest.manifest import Manifest
     from anytouch_jax.encoder.encoder import Encoder
     from anytouch_jax.evaluate.tasks import TaskRows
@@ -101,15 +104,34 @@ def fit_head(
     if several:
         # A fold that lacks a name is not counted, so recordings that stand alone cost some.
         count = max(1, several - once * math.ceil(len(recorded) / splits.FOLDS))
-        # Under nine recordings nothing can be promised: sets hold every name, and nothing is novel.
-        # From nine on, false alarms are as rare as so many recordings allow.
-        false_alarms = FALSE_ALARMS
-        if count >= FEWEST:
-            false_alarms = max(FALSE_ALARMS, math.ceil(100 / (count + 1)) / 100)
         head = probing.calibrated(
-            head, x, rows, penalty, log, coverage=COVERAGE, false_alarms=false_alarms
+            head,
+            x,
+            rows,
+            penalty,
+            log,
+            coverage=COVERAGE,
+            false_alarms=false_alarms_of(count),
         )
     return TaughtHead(head, x, ids, rows, names[times > 1], once)
+
+
+def recordings_of(file: Path, sensor: str) -> int:
+    """Return the number of recordings by a sensor in a manifest."""
+    table = manifests.read(file)
+    own = table.text_column("sensor") == sensor
+    return len(np.unique(table.text_column("sequence")[own]))
+
+
+def false_alarms_of(recordings: int) -> float:
+    """Return the fraction of known touches that a head of so many recordings may call novel.
+
+    Under nine recordings nothing can be promised: sets hold every name, and nothing is novel. From
+    nine on, false alarms are as rare as so many recordings allow.
+    """
+    if recordings < FEWEST:
+        return FALSE_ALARMS
+    return max(FALSE_ALARMS, math.ceil(100 / (recordings + 1)) / 100)
 
 
 def _typical(table: Manifest, rows: TaskRows, threshold: float) -> Array:

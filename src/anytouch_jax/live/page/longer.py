@@ -17,6 +17,7 @@ from anytouch_jax.encoder.arrays import Array
 from anytouch_jax.encoder.linear_head import HEAD, Head, load_head
 from anytouch_jax.errors import UserError
 from anytouch_jax.files import atomic_write
+from anytouch_jax.live.page.fitting import false_alarms_of, recordings_of
 from anytouch_jax.live.page.recorder import SCORE, LiveRecorder
 
 if TYPE_CHECKING:
@@ -143,6 +144,7 @@ class LongerTraining:
         fresh = self._folder.with_name(f".{_FOLDER}_{sensor}.new")
         shutil.rmtree(fresh, ignore_errors=True)
         options = FinetuneOptions(
+            false_alarms=false_alarms_of(recordings_of(self._recorder.file, sensor)),
             minutes=MINUTES,
             group="sequence",
             sensor=sensor,

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import textwrap
 import threading
+import time
 import zipfile
 import zlib
 from concurrent.futures import ThreadPoolExecutor
@@ -120,6 +121,7 @@ def test_one_thread_saves_while_another_loads(tmp_path):
     def load() -> None:
         while not done:
             loaded.append(load_params(tmp_path / "read")[0]["logit_scale"])
+            time.sleep(0.01)  # a lock is not fair: on one core the other would wait for minutes
 
     with ThreadPoolExecutor(1) as other:
         loading = other.submit(load)

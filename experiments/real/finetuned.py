@@ -1,7 +1,7 @@
 """Fine-tuning on real recordings: head and encoder trained on labels, for the three questions of
 `experiments.real.run`.
 
-    python -m experiments.real.finetuned anytouch-tiny --minutes 3
+    python -m experiments.real.finetuned anytouch-tiny --minutes 1
 
 The minutes are of each training. There is one for the objects, there are two for the other finger,
 and five for slip. It writes a row to `experiments/results/real.jsonl`, scored as

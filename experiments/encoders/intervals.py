@@ -31,13 +31,13 @@ from anytouch_jax.sim.recorder import simulate_touch
 from anytouch_jax.sim.sensing.sensors import SENSORS, draw_unit
 from anytouch_jax.train.mesh import enable_compilation_cache
 from experiments.command import run_script
+from experiments.encoders.measure import STIFFNESS
 from experiments.records import write_record
 
 Array = npt.NDArray[Any]
 FAMILIES = ("gelsight_mini", "digit", "gelslim", "9dtact")
 _SIDE = 120  # cells of 0.1 mm of a height map
 _DEPTHS = (0.25, 0.5, 0.8, 1.1)  # mm
-_MODULUS = 0.15  # deviation of its logarithm among gels of a family
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ def presses(encoder: Any, name: str, units: int, seed: int) -> Iterator[Presses]
 
     for _ in range(units):
         unit = draw_unit(sensor, rng)
-        stiffness = float(np.exp(rng.normal(0, _MODULUS)))
+        stiffness = float(np.exp(rng.normal(0, STIFFNESS)))
         frames = []
         forces = []
         numbers = []

@@ -54,8 +54,9 @@ INTERVALS = {
     "family": (0.35, 0.35),
     "unknown": (0.9, 1.7),
 }
-# What it reaches further up for a contact that covers the whole border of the image: how deep the
-# gel is there cannot be seen, and cloth over a whole gel is read at half of its depth.
+# What is added to the factor up, also as a logarithm, for a contact that covers the whole border of
+# the image: how deep the gel is there cannot be seen, and cloth over a whole gel is read at half of
+# its depth.
 BEYOND_BORDER = 1.2
 Z = 1.645  # standard deviations from the mean to 5 and 95 %
 # The deviation of a normal force is a factor. Below this force, over modulus times width squared,

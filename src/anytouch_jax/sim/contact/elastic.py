@@ -387,13 +387,7 @@ def tangential_spectra(
 ) -> Array:
     """Return the spectra (3, KH, KW) of the tangential coefficients xx, xy, yy.
 
-    Args:
-        plan: The transform of the grid.
-        pitch: mm between pixels.
-        poisson: Poisson's ratio of the gel.
-        thickness: mm of the gel; infinite for a half-space.
-        fraction: E* over the gel's plane modulus: the part of the motion that is the layer's.
-        dtype: Of the spectra.
+    Arguments are those of `normal_spectrum`.
     """
     if is_infinite(thickness):
         return jnp.asarray(_tangential_host(plan, poisson), dtype)
